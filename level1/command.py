@@ -1,0 +1,22 @@
+"""A command to the core, already authenticated: who may command what is the business of the bridge's gate."""
+from __future__ import annotations
+
+from decimal import Decimal
+from typing import Literal
+
+import msgspec
+
+
+class Order(msgspec.Struct, frozen=True):
+    """A command.
+
+    id: names it in its `Result`. name: acknowledge, reset, pause, resume, stop, or one that `Commands` in a DBC names.
+    target: alarm name (acknowledge, reset; "" means all for acknowledge). value: the `$value` of a DBC command, physical.
+    origin: "local" (someone at the machine) or "above" (level 2).
+    """
+
+    id: str
+    name: str
+    target: str = ""
+    value: Decimal | None = None
+    origin: Literal["local", "above"] = "above"
