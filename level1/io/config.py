@@ -1,0 +1,313 @@
+"""`unit.toml`: what a unit is called, which buses it has, which repairs may act, where its journal and its level 2 are.
+
+Every mistake is found at load, all of them at once, each one line: file, path of the key, what is wrong, what to do.
+A key with a duration is written `period = "250 ms"` and held in nanoseconds as `period_ns`.
+"""
+from __future__ import annotations
+
+import re
+import tomllib
+import types
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin
+from urllib.parse import urlsplit
+
+import msgspec
+
+from level1.catalog import Catalog
+from level1.io.error import OutsideError, did_you_mean
+
+UNITS_NS = {"us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "min": 60_000_000_000, "h": 3_600_000_000_000}
+SCHEMES = ("mqtt", "mqtts")
+_DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)")
+_TOPIC_LEVEL = re.compile(r"[^\s/+#$][^\s/+#]*")
+_KINDS = {str: "a text", int: "a whole number", bool: "true or false", float: "a number", dict: "a table"}
+
+
+class ConfigError(OutsideError):
+    """A configuration that can't be used; `problems` holds every mistake found."""
+
+
+class Unit(msgspec.Struct, frozen=True):
+    """Who this is: a vehicle with its implement, in a fleet. Both names are levels of MQTT topics (DESIGN §6)."""
+
+    name: str
+    fleet: str = "fleet"
+
+
+class Bus(msgspec.Struct, frozen=True):
+    """A CAN bus. interface, channel, bitrate, fd: as python-can takes them; options: further arguments of the interface.
+
+    dbc: files bound to this bus; a name that is no file beside the configuration is one of the shipped definitions.
+    """
+
+    name: str
+    channel: str
+    dbc: tuple[str, ...] = ()
+    interface: str = "socketcan"
+    bitrate: int | None = None
+    fd: bool = False
+    options: dict[str, Any] = {}
+
+
+class Gnss(msgspec.Struct, frozen=True):
+    """A GNSS receiver on a serial line; baud in bit/s (NMEA 0183's own rate is 4800)."""
+
+    port: str
+    baud: int = 115200
+
+
+class Repairs(msgspec.Struct, frozen=True):
+    """Alarms whose repair may act; every other repair runs passive (DESIGN §5)."""
+
+    armed: tuple[str, ...] = ()
+
+
+class JournalFile(msgspec.Struct, frozen=True):
+    """The journal's SQLite file; a relative path counts from the configuration's folder."""
+
+    path: str
+
+
+class BridgeSettings(msgspec.Struct, frozen=True):
+    """The way to level 2: broker as `mqtt://host:1883` or `mqtts://host:8883`; period of the monitoring messages.
+
+    ca, certificate, key: PEM files for mqtts. keys: file with the public keys of those who may command.
+    """
+
+    broker: str
+    period_ns: int = 250_000_000
+    ca: str | None = None
+    certificate: str | None = None
+    key: str | None = None
+    keys: str | None = None
+
+
+class Config(msgspec.Struct, frozen=True):
+    """A checked `unit.toml`; paths in it are resolved."""
+
+    unit: Unit
+    bus: tuple[Bus, ...]
+    repairs: Repairs = Repairs()
+    journal: JournalFile | None = None
+    bridge: BridgeSettings | None = None
+    gnss: Gnss | None = None
+    path: str = ""
+
+    @property
+    def bus_files(self) -> dict[int, tuple[str, ...]]:
+        """Index of each bus -> its DBC files, as `level1.io.definitions.load` takes them."""
+        return {index: bus.dbc for index, bus in enumerate(self.bus)}
+
+
+def load(path: str | Path) -> Config:
+    """The configuration in a file. Raises ConfigError with every mistake found."""
+    file = Path(path)
+    try:
+        table = tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{file}: no such file; give the path of a unit.toml") from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text in UTF-8"
+        raise ConfigError(f"{file}: can't be read: {reason}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{file}: not TOML: {error}") from None
+    return parse(table, str(file))
+
+
+def parse(table: Mapping[str, Any], path: str) -> Config:
+    """The configuration in a TOML table read from `path`. Raises ConfigError with every mistake found."""
+    found = [*_struct_problems(table, Config, ""), *_rule_problems(table)]
+    if found:
+        raise ConfigError(*(f"{path}: {problem}" for problem in found))
+    return _resolved(msgspec.convert(_plain(table, Config), Config), path)
+
+
+def check_armed(config: Config, catalog: Catalog) -> None:
+    """Check that every armed name is an alarm with a repair. Raises ConfigError with every one that is not."""
+    repairable = [name for name, alarm in catalog.alarms.items() if alarm.repair]
+    problems = []
+    for index, name in enumerate(config.repairs.armed):
+        where = f"{config.path}: repairs.armed[{index}]"
+        if name not in catalog.alarms:
+            problems.append(f'{where}: no alarm is called "{name}"{did_you_mean(name, repairable)}')
+        elif name not in repairable:
+            problems.append(f'{where}: the alarm "{name}" has no repair; take it out of the list')
+    if problems:
+        raise ConfigError(*problems)
+
+
+def duration_ns(text: str) -> int:
+    """Nanoseconds of a duration with its unit, such as `250 ms`. Raises ValueError with what to write instead."""
+    match = _DURATION.fullmatch(text.strip())
+    if not match or match[2] not in UNITS_NS:
+        raise ValueError(f'"{text}" is no duration; write a number and a unit ({", ".join(UNITS_NS)}), such as "250 ms"')
+    whole, _, fraction = match[1].partition(".")
+    return int(whole + fraction) * UNITS_NS[match[2]] // int(10 ** len(fraction))
+
+
+def _key(field: msgspec.structs.FieldInfo) -> str:
+    """The name a field has in the file."""
+    return field.name.removesuffix("_ns")
+
+
+def _fields(struct: type[msgspec.Struct]) -> dict[str, msgspec.structs.FieldInfo]:
+    """Fields of a table by the key in the file; `Config.path` is no key."""
+    return {_key(field): field for field in msgspec.structs.fields(struct) if (struct, field.name) != (Config, "path")}
+
+
+def _struct_problems(table: Any, struct: type[msgspec.Struct], where: str) -> Iterator[str]:
+    """Unknown, missing and wrongly typed keys of a table."""
+    if not isinstance(table, Mapping):
+        yield f"{where}: expected a table, found {_kind(table)}"
+        return
+    fields = _fields(struct)
+    for key in table:
+        if key not in fields:
+            yield f"{where}{'.' * bool(where)}{key}: unknown key{did_you_mean(key, fields)}"
+    for key, field in fields.items():
+        path = f"{where}{'.' * bool(where)}{key}"
+        if key in table:
+            yield from _value_problems(table[key], field, path)
+        elif field.required:
+            yield f"{path}: missing"
+
+
+def _value_problems(value: Any, field: msgspec.structs.FieldInfo, path: str) -> Iterator[str]:
+    """What is wrong with the value of a key."""
+    kind = _without_none(field.type)
+    if field.name.endswith("_ns"):
+        yield from _duration_problems(value, path)
+    elif isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        yield from _struct_problems(value, kind, path)
+    elif get_origin(kind) is tuple:
+        yield from _list_problems(value, get_args(kind)[0], path)
+    elif not _is(value, get_origin(kind) or kind):
+        yield f"{path}: expected {_KINDS[get_origin(kind) or kind]}, found {_kind(value)}"
+
+
+def _list_problems(value: Any, item: Any, path: str) -> Iterator[str]:
+    if not isinstance(value, list):
+        many = f"[[{path}]] tables" if item not in _KINDS else 'a list such as ["…", "…"]'
+        yield f"{path}: expected {many}, found {_kind(value)}"
+        return
+    for index, element in enumerate(value):
+        if item not in _KINDS:
+            yield from _struct_problems(element, item, f"{path}[{index}]")
+        elif not _is(element, item):
+            yield f"{path}[{index}]: expected {_KINDS[item]}, found {_kind(element)}"
+
+
+def _duration_problems(value: Any, path: str) -> Iterator[str]:
+    if not isinstance(value, str):
+        yield f'{path}: expected a duration with its unit, such as "250 ms", found {_kind(value)}'
+        return
+    try:
+        duration_ns(value)
+    except ValueError as error:
+        yield f"{path}: {error}"
+
+
+def _rule_problems(table: Mapping[str, Any]) -> Iterator[str]:
+    """What types can't say. Looks only at values of the right type: the others are told already."""
+    unit, bridge, gnss = (_sub(table, name) for name in ("unit", "bridge", "gnss"))
+    for key in ("name", "fleet"):
+        name = unit.get(key)
+        if isinstance(name, str) and not _TOPIC_LEVEL.fullmatch(name):
+            yield f'unit.{key}: "{name}" can\'t stand in an MQTT topic; use letters, digits and "-", no space, "/", "+", "#"'
+    yield from _bus_problems(table.get("bus"))
+    broker = bridge.get("broker")
+    if isinstance(broker, str) and (problem := _broker_problem(broker)):
+        yield f'bridge.broker: "{broker}" {problem}; write "mqtt://host:1883" or "mqtts://host:8883"'
+    period = bridge.get("period")
+    if isinstance(period, str) and not list(_duration_problems(period, "")) and not 10**7 <= duration_ns(period) <= 6 * 10**10:
+        yield f'bridge.period: "{period}" is outside 10 ms to 1 min'
+    baud = gnss.get("baud")
+    if isinstance(baud, int) and not 1200 <= baud <= 4_000_000:
+        yield f"gnss.baud: {baud} is outside 1200 to 4000000 bit/s"
+
+
+def _bus_problems(buses: Any) -> Iterator[str]:
+    if not isinstance(buses, list):
+        return
+    if not buses:
+        yield "bus: no bus; add a [[bus]] table with name, channel and dbc"
+    tables = [bus if isinstance(bus, Mapping) else {} for bus in buses]
+    names = Counter(str(bus.get("name")) for bus in tables if "name" in bus)
+    wires = Counter((str(bus.get("interface", "socketcan")), str(bus.get("channel"))) for bus in tables if "channel" in bus)
+    yield from (f'bus: {count} buses are called "{name}"; give each its own name' for name, count in names.items() if count > 1)
+    yield from (f'bus: {count} buses use the {wire[0]} channel "{wire[1]}"; join their dbc lists' for wire, count in wires.items()
+                if count > 1)
+    if buses and not any(bus.get("dbc") for bus in tables):
+        yield 'bus[0].dbc: no bus has definitions; name the DBC files, such as dbc = ["flaming_tool.dbc"]'
+
+
+def _broker_problem(url: str) -> str:
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError:
+        return "has a wrong port"
+    if parts.scheme not in SCHEMES:
+        return "is no MQTT address" + (did_you_mean(parts.scheme, SCHEMES) if parts.scheme else "")
+    if not parts.hostname:
+        return "names no host"
+    return "has a wrong port" if port == 0 else ""
+
+
+def _plain(value: Any, kind: Any) -> Any:
+    """The table with durations in nanoseconds, as msgspec converts it; only called on tables without problems."""
+    kind = _without_none(kind)
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        fields = _fields(kind)
+        return {fields[key].name: duration_ns(item) if fields[key].name.endswith("_ns") else _plain(item, fields[key].type)
+                for key, item in value.items()}
+    if get_origin(kind) is tuple:
+        return [_plain(item, get_args(kind)[0]) for item in value]
+    return value
+
+
+def _resolved(config: Config, path: str) -> Config:
+    """The configuration with paths that count from its own folder made independent of the working directory."""
+    folder = Path(path).parent
+
+    def beside(name: str) -> str:
+        return str(folder / name)
+
+    def definitions(name: str) -> str:
+        return beside(name) if (folder / name).exists() else name
+
+    buses = tuple(msgspec.structs.replace(bus, dbc=tuple(map(definitions, bus.dbc))) for bus in config.bus)
+    journal = config.journal and JournalFile(beside(config.journal.path))
+    bridge = config.bridge
+    if bridge:
+        files = {key: beside(name) for key in ("ca", "certificate", "key", "keys") if (name := getattr(bridge, key))}
+        bridge = msgspec.structs.replace(bridge, **files)
+    return msgspec.structs.replace(config, bus=buses, journal=journal, bridge=bridge, path=path)
+
+
+def _sub(table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = table.get(key)
+    return value if isinstance(value, Mapping) else {}
+
+
+def _without_none(kind: Any) -> Any:
+    """`X` of `X | None`."""
+    if get_origin(kind) in (Union, types.UnionType):
+        return next(item for item in get_args(kind) if item is not type(None))
+    return kind
+
+
+def _is(value: Any, kind: type) -> bool:
+    """isinstance, but `true` is no number."""
+    return isinstance(value, kind) and not (isinstance(value, bool) and kind is not bool)
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, list):
+        return "a list"
+    if isinstance(value, Mapping):
+        return "a table"
+    return next((f"{name} ({value!r})" for kind, name in _KINDS.items() if _is(value, kind)), type(value).__name__)

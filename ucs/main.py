@@ -1,0 +1,130 @@
+"""`ucs`: one command, a module each subcommand; only the chosen one is imported.
+
+A subcommand's module offers `add_parser(subparsers)` and `run(args) -> int`. Exit codes: what `run` returns; 1 where
+definitions have errors (all are printed), 2 where something outside prevents the work (one line each: `ucs: …`),
+130 after Ctrl-C, 141 when the reader of the output went away (as the shell counts SIGPIPE).
+"""
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any, NamedTuple, NoReturn
+
+INTERRUPTED, BROKEN_PIPE = 130, 141
+
+
+class Command(NamedTuple):
+    """Where a subcommand lives and what it does, in one line."""
+
+    module: str
+    help: str
+
+
+COMMANDS = {
+    "demo": Command("ucs.demo", "a simulated tractor loses its pilot flame, told as it happens"),
+    "check": Command("ucs.check", "check alarm definitions in DBC files"),
+    "alarms": Command("ucs.check", "list the alarms that DBC files define"),
+    "run": Command("ucs.run", "supervise a unit live"),
+    "replay": Command("ucs.replay", "run alarm definitions over recordings"),
+    "simulate": Command("ucs.simulate", "simulate the nodes on the bus, with faults as a scenario says"),
+    "bridge": Command("ucs.bridge", "carry a unit's events to level 2 and commands back"),
+    "level2": Command("ucs.level2", "receive, store and acknowledge what units send"),
+    "journal": Command("ucs.journal", "list and export what a unit's journal holds"),
+}
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser that tells a mistake in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        print(f"ucs: {message} (see {self.prog} --help)", file=sys.stderr)
+        sys.exit(2)
+
+
+class _Version(argparse.Action):
+    """`--version`, looked up only when asked for."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **_: Any):
+        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help="print the version and exit")
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from importlib.metadata import PackageNotFoundError, version
+        try:
+            found = version("tractor-ucs")
+        except PackageNotFoundError:
+            found = "of a source folder that is not installed"
+        print(f"ucs {found}")
+        parser.exit()
+
+
+def build_parser(chosen: str | None) -> argparse.ArgumentParser:
+    """The command line, with the arguments of the chosen subcommand; the others stand there by name and help only."""
+    parser = _Parser(
+        prog="ucs", description="Supervision of a tractor and its implements: alarms, repairs, and the way to level 2.",
+        epilog="`ucs COMMAND --help` tells more about a command; `ucs demo` shows it all.")
+    parser.add_argument("--version", action=_Version)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    loaded = COMMANDS[chosen].module if chosen else None
+    for name, command in COMMANDS.items():
+        if name == chosen:
+            importlib.import_module(command.module).add_parser(commands)
+        elif command.module != loaded:
+            commands.add_parser(name, help=command.help, add_help=False)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and give its exit code. Raises SystemExit for `--help` and wrong arguments (code 2)."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = _run(words)
+        sys.stdout.flush()
+        return code
+    except KeyboardInterrupt:
+        print("ucs: stopped by Ctrl-C", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
+
+
+def _run(words: list[str]) -> int:
+    from level1.catalog import DefinitionError
+    from level1.io.error import OutsideError, did_you_mean
+    chosen = words[0] if words else "--help"
+    if chosen not in COMMANDS and not chosen.startswith("-"):
+        return _refuse(f'no command is called "{chosen}"{did_you_mean(chosen, COMMANDS)}')
+    parser = build_parser(chosen if chosen in COMMANDS else None)
+    if not words:
+        parser.print_help(sys.stderr)
+        return 2
+    args = parser.parse_args(words)
+    try:
+        code: int = importlib.import_module(COMMANDS[args.command].module).run(args)
+        return code
+    except DefinitionError as error:
+        sys.stdout.flush()
+        print(*error.problems, sep="\n", file=sys.stderr)
+        return 1
+    except OutsideError as error:
+        return _refuse(*error.problems)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _refuse(f"{where}{error.strerror or error}")
+
+
+def _refuse(*problems: str) -> int:
+    """Say why it can't go on, after what was said before."""
+    sys.stdout.flush()
+    for problem in problems:
+        print(f"ucs: {problem}", file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())
