@@ -1,0 +1,290 @@
+"""The local repair of one alarm, reported as an episode (DESIGN §4, §5).
+
+Theory of operation. An *attempt* runs the steps of the definition to their end, also when the condition clears in between
+(the igniter must go off again). It succeeds when its last step is done and the alarm's condition no longer holds. It fails at
+once when an `expect` runs out, when its feedback is lost, or when the unit is stopped or paused from above. **A failed attempt
+enters the safe state (the sends of RepairGiveUp) immediately**, before the pause: an ignition trial that failed must not leave
+the valve open while the next one is awaited. When as many attempts as the budget allows have begun within its window, the next
+failure, or the next activation, locks the alarm out: safe state, held until a reset on board.
+
+From the first attempt to the end of the episode the repair owns its command messages: it repeats them at their cycle time,
+and the alarm signal on the bus reads Repairing, upon which other programs stop sending them. One message serves one repair at a
+time; an alarm of higher priority takes it from one of lower.
+
+An attempt does not start (it waits) while its feedback is unknown, its message belongs to another, or the unit is stopped or
+paused from above. A repair that is not armed runs passive: it reports once for each activation what it would have sent.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from level1.alarm import AlarmMachine
+from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Repair
+from level1.condition import Verdict, Zone
+from level1.event import PRIORITIES, SentFrame
+from level1.expression import ExpectStep, ResendStep, SendStep, Step, WaitStep
+from level1.gate import Refused
+from level1.timer import FAR, Timers
+
+
+class Host(Protocol):
+    """What a repair asks of the supervisor."""
+
+    def emit(self, alarm: AlarmMachine, t_ns: int, event: str, text: str = "", attempt: int = 0,
+             frames: tuple[SentFrame, ...] = (), passive: bool = False) -> int:
+        """Report a step upward."""
+
+    def is_armed(self, alarm: AlarmMachine) -> bool:
+        """Whether the unit's configuration lets it act."""
+
+    def forbidden(self, repair: Repair) -> str:
+        """Why no repair of this kind may act now (stopped, paused from above); empty when it may."""
+
+    def claim(self, owner: RepairMachine, t_ns: int, messages: Sequence[str]) -> str:
+        """Own these command messages; gives the name of the alarm that keeps one, else an empty string."""
+
+    def release(self, owner: RepairMachine, t_ns: int) -> None:
+        """Hand all owned messages back."""
+
+    def transmit(self, owner: RepairMachine, t_ns: int, step: SendStep | ResendStep) -> None:
+        """Send a step's frame and go on repeating it. Raises gate.Refused."""
+
+    def preview(self, owner: RepairMachine, steps: Sequence[Step]) -> tuple[SentFrame, ...]:
+        """The frames that these steps send."""
+
+
+IDLE, RUNNING, PAUSING, WAITING = range(4)
+
+
+class RepairMachine:
+    """The repair of one alarm at run time. phase: IDLE, RUNNING (a step waits), PAUSING (between attempts), WAITING (may not act).
+
+    begun_ns: when the attempts within the window began. attempt: number of the present or last attempt of this activation.
+    expects: a closure with the verdict for each expect step; feedback(): worst verdict of all of them, unknown or not.
+    """
+
+    __slots__ = ("alarm", "attempt", "begun_ns", "definition", "due", "expects", "feedback", "host", "order", "phase", "position",
+                 "reported", "timers")
+
+    def __init__(self, alarm: AlarmMachine, definition: Repair, host: Host, timers: Timers,
+                 expects: dict[int, Callable[[], int]], feedback: Callable[[], int]):
+        self.alarm = alarm
+        self.definition = definition
+        self.host = host
+        self.timers = timers
+        self.order = timers.order()
+        self.due = FAR
+        self.expects = expects
+        self.feedback = feedback
+        self.phase = IDLE
+        self.position = 0
+        self.attempt = 0
+        self.begun_ns: list[int] = []
+        self.reported = False
+
+    @property
+    def rank(self) -> int:
+        """Higher takes a command message from lower."""
+        return PRIORITIES.index(self.alarm.definition.priority)
+
+    @property
+    def messages(self) -> list[str]:
+        """The command messages it needs, each once."""
+        steps = (*self.definition.steps, *self.definition.give_up)
+        return list(dict.fromkeys(step.message for step in steps if isinstance(step, (SendStep, ResendStep))))
+
+    # --- what can happen to it --------------------------------------------------------------------------------------------
+
+    def zone(self, t_ns: int) -> None:
+        """The alarm has been raised, or its zone has changed while it was active."""
+        if self.phase == RUNNING:
+            if self.alarm.zone in (Zone.STALE, Zone.ERROR):
+                self.fail(t_ns, "its inputs are missing or wrong")
+        elif self.phase != PAUSING:
+            self.consider(t_ns)
+
+    def feedback_changed(self, t_ns: int, verdict: int) -> None:
+        """The feedback has become known (0) or unknown (STALE, ERROR)."""
+        if self.phase == RUNNING:
+            if verdict:
+                self.fail(t_ns, "its feedback is missing or wrong")
+        elif self.phase == WAITING:
+            self.consider(t_ns)
+
+    def expectation_changed(self, t_ns: int, position: int, verdict: int) -> None:
+        """The condition of an expect step has another verdict."""
+        if self.phase == RUNNING and self.position == position and verdict == Verdict.TRUE:
+            self.due = FAR
+            self.position += 1
+            self.run(t_ns)
+
+    def circumstances_changed(self, t_ns: int) -> None:
+        """The unit was stopped, paused or released, or a command message has become free."""
+        if self.alarm.state == LOCKED_OUT:
+            self._hold_safe_state(t_ns)
+        elif self.phase == RUNNING and (why := self.host.forbidden(self.definition)):
+            self.fail(t_ns, why)
+        elif self.phase == WAITING:
+            self.consider(t_ns)
+
+    def taken(self, t_ns: int, by: str) -> None:
+        """A repair of higher priority needs the message. A lock-out stays one, and takes it back when it is free."""
+        if self.alarm.state == LOCKED_OUT:
+            return
+        if self.phase == RUNNING:
+            self._report_failure(t_ns, f"{by} needs its command message")
+        self.due = FAR
+        self.phase = WAITING
+        self.alarm.enter(t_ns, ACTIVE)
+
+    def expire(self, now_ns: int) -> None:
+        """A wait is over, an expect has run out, or the pause between attempts has passed."""
+        if self.phase == PAUSING:
+            self.phase = WAITING
+            self.consider(now_ns)
+            return
+        step = self.definition.steps[self.position]
+        if isinstance(step, ExpectStep):
+            self.fail(now_ns, f"expected {step.text} within {step.within_ns / 1e9:g} s")
+        else:
+            self.position += 1
+            self.run(now_ns)
+
+    def clear(self, t_ns: int) -> None:
+        """The alarm has cleared: the episode is over."""
+        self.due = FAR
+        self.phase = IDLE
+        self.attempt = 0
+        self.reported = False
+        self.host.release(self, t_ns)
+
+    def restore(self, t_ns: int, attempt: int, begun_ns: list[int]) -> None:
+        """Go on after a restart of the program: an attempt that was under way has failed, a lock-out is still one."""
+        self.attempt = attempt
+        self.begun_ns = begun_ns
+        if self.alarm.state == LOCKED_OUT:
+            self._hold_safe_state(t_ns)
+        elif self.alarm.state == REPAIRING:
+            self.host.claim(self, t_ns, self.messages)
+            self.fail(t_ns, "the supervisor was restarted during the attempt")
+
+    # --- what it does -----------------------------------------------------------------------------------------------------
+
+    def consider(self, t_ns: int) -> None:
+        """Start an attempt, wait, lock out, or end the episode, as the circumstances are."""
+        alarm = self.alarm
+        if alarm.state in (NORMAL, LOCKED_OUT):
+            return
+        if alarm.zone != Zone.RAISE:
+            if alarm.zone in (Zone.CLEAR, Zone.NEITHER) and self.phase == WAITING:
+                self._end(t_ns)
+            return
+        if not self.host.is_armed(alarm):
+            self._report_passive(t_ns)
+            return
+        if self.spent(t_ns):
+            self.lock_out(t_ns, "as many attempts as the budget allows were made lately")
+            return
+        self.phase = WAITING
+        if self.feedback() or self.host.forbidden(self.definition) or self.host.claim(self, t_ns, self.messages):
+            return
+        self._start(t_ns)
+
+    def spent(self, t_ns: int) -> bool:
+        """Whether the budget of attempts within the window is used up."""
+        self.begun_ns = [begun for begun in self.begun_ns if begun > t_ns - self.definition.window_ns]
+        return len(self.begun_ns) >= self.definition.attempts
+
+    def _start(self, t_ns: int) -> None:
+        self.phase = RUNNING
+        self.position = 0
+        self.attempt += 1
+        self.begun_ns.append(t_ns)
+        frames = self.host.preview(self, self.definition.steps)
+        self.host.emit(self.alarm, t_ns, "repair_started", self.definition.text, self.attempt, frames)
+        self.alarm.enter(t_ns, REPAIRING)
+        self.run(t_ns)
+
+    def run(self, t_ns: int) -> None:
+        """Go on from the present step until one has to wait."""
+        steps = self.definition.steps
+        while self.phase == RUNNING and self.position < len(steps):
+            step = steps[self.position]
+            if isinstance(step, WaitStep):
+                self.timers.set(self, t_ns + step.duration_ns)
+                return
+            if isinstance(step, ExpectStep):
+                if self.expects[self.position]() != Verdict.TRUE:
+                    self.timers.set(self, t_ns + step.within_ns)
+                    return
+            elif not self._transmit(t_ns, step):
+                return
+            self.position += 1
+        if self.phase == RUNNING:
+            self._finish(t_ns)
+
+    def _transmit(self, t_ns: int, step: SendStep | ResendStep) -> bool:
+        try:
+            self.host.transmit(self, t_ns, step)
+        except Refused as refusal:
+            self.fail(t_ns, str(refusal))
+            return False
+        return True
+
+    def _finish(self, t_ns: int) -> None:
+        if self.alarm.zone == Zone.RAISE:
+            self.fail(t_ns, "all steps are done, but its condition still holds")
+            return
+        self.host.emit(self.alarm, t_ns, "repaired", "", self.attempt)
+        self._end(t_ns)
+
+    def _end(self, t_ns: int) -> None:
+        self.phase = IDLE
+        self.due = FAR
+        self.host.release(self, t_ns)
+        self.alarm.enter(t_ns, ACTIVE)
+        self.alarm.try_clear(t_ns)
+
+    def fail(self, t_ns: int, why: str) -> None:
+        """The present attempt has failed: safe state at once; then a pause, or lock-out when the budget is spent."""
+        self._report_failure(t_ns, why)
+        if self.spent(t_ns):
+            self.lock_out(t_ns, "the last attempt of the budget has failed")
+            return
+        self._safe_state(t_ns)
+        self.phase = PAUSING
+        if self.definition.pause_ns:
+            self.timers.set(self, t_ns + self.definition.pause_ns)
+        else:
+            self.expire(t_ns)
+
+    def _report_failure(self, t_ns: int, why: str) -> None:
+        self.due = FAR
+        self.host.emit(self.alarm, t_ns, "repair_failed", why, self.attempt)
+
+    def lock_out(self, t_ns: int, why: str) -> None:
+        """Give up: into the safe state, and hold it."""
+        self.due = FAR
+        self.phase = IDLE
+        self.host.emit(self.alarm, t_ns, "locked_out", why, self.attempt)
+        self.alarm.enter(t_ns, LOCKED_OUT)
+        self._hold_safe_state(t_ns)
+
+    def _hold_safe_state(self, t_ns: int) -> None:
+        self.host.claim(self, t_ns, self.messages)
+        self._safe_state(t_ns)
+
+    def _safe_state(self, t_ns: int) -> None:
+        for step in self.definition.give_up:
+            if isinstance(step, (SendStep, ResendStep)):
+                try:
+                    self.host.transmit(self, t_ns, step)
+                except Refused:
+                    continue
+
+    def _report_passive(self, t_ns: int) -> None:
+        if not self.reported:
+            self.reported = True
+            frames = self.host.preview(self, self.definition.steps)
+            self.host.emit(self.alarm, t_ns, "repair_started", self.definition.text, 1, frames, passive=True)

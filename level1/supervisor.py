@@ -1,0 +1,675 @@
+"""The supervisor of one unit: frames and time in, events and frames out. A function of what it is given; it performs no I/O.
+
+Live, replay, simulation and tests drive this one object. Deadlines fall exactly where they belong: everything due up to the
+time of an input happens first, in order, each at its own time. The same input gives the same events, byte for byte, whether
+it comes frame by frame or in batches. A time stamp that runs backwards is clamped to the last one and counted.
+"""
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Sequence
+from datetime import UTC, datetime, timedelta
+from fractions import Fraction
+from itertools import chain
+from typing import Any
+
+import msgspec
+
+from level1.alarm import AlarmMachine
+from level1.board import ALWAYS, Board, Cell, Page, Watch
+from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Alarm, Catalog, Command, Message, Repair
+from level1.command import Order
+from level1.condition import Compiler, Things, Thresholds, Verdict, Zone, walk
+from level1.decode import GOOD, QUALITY_WORDS, RawValue, encode
+from level1.event import Event, Monitor, Output, Result, Send, SentFrame, seconds
+from level1.expression import AlarmState, Count, Elapsed, ExpectStep, Expression, Quality, Rate, ResendStep, SendStep, SignalValue, Silent, Step
+from level1.frame import EXTENDED, Frame, frame_key
+from level1.gate import Gate, Refused
+from level1.repair import RepairMachine
+from level1.timer import FAR, Timers
+
+STATE_WORDS = ("Normal", "Active", "Repairing", "LockedOut")
+UNTOLD = -1
+"""Outcome of a condition before its first evaluation: whatever it is then, its alarm is told."""
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_MISSING: Any = object()
+
+
+class AlarmMemory(msgspec.Struct, frozen=True):
+    """What survives a restart of one alarm. begun_ago_ns, raised_ago_ns: ages of attempts and activations when it was stored."""
+
+    name: str
+    state: int
+    instance: int
+    acknowledged: bool
+    attempt: int
+    begun_ago_ns: tuple[int, ...]
+    raised_ago_ns: tuple[int, ...]
+
+
+class State(msgspec.Struct, frozen=True):
+    """What survives a restart: latches, lock-outs, budgets, activations, the mode ordered from above. No time stamps: the
+    monotonic time line begins anew; time spent switched off does not count, which keeps budgets on the strict side."""
+
+    mode: str
+    alarms: tuple[AlarmMemory, ...]
+
+
+class Supervisor:
+    """Supervises one unit.
+
+    unit: its name. boot, with the seq given to each event, is the event's identity: never give the same boot twice. seq: last
+    one used. armed: alarms whose repairs may act; None arms all. broadcast: send the alarm messages on the bus. start_ns: when
+    the time line begins, None: at the first input. monitor_ns: period of the monitoring messages, None for none.
+    utc_offset_ns: UTC minus time line, None where no wall clock is known; it may be set at any time, as may utc_trusted.
+    restored: the state stored at the end of an earlier boot.
+    """
+
+    def __init__(self, catalog: Catalog, *, unit: str, boot: int = 1, seq: int = 0, armed: Collection[str] | None = None,
+                 broadcast: bool = True, start_ns: int | None = None, monitor_ns: int | None = None,
+                 utc_offset_ns: int | None = None, utc_trusted: bool = False, restored: State | None = None):
+        self.catalog = catalog
+        self.unit = unit
+        self.boot = boot
+        self.seq = seq
+        self.armed = None if armed is None else frozenset(armed)
+        self.utc_offset_ns = utc_offset_ns
+        self.utc_trusted = utc_trusted
+        self.mode = restored.mode if restored is not None else "running"
+        self.timers = Timers()
+        self.board = Board(catalog, self.timers)
+        self.counters = self.board.counters
+        self.now_ns = start_ns if start_ns is not None else -FAR
+        self._begun = False
+        self._restored = restored
+        self._out: list[Output] = []
+        self._things = Things()
+        self._alarms = {name: AlarmMachine(alarm, self, self.timers) for name, alarm in catalog.alarms.items()}
+        self._raised: dict[str, deque[int]] = {name: deque() for name in catalog.alarms}
+        self._counts: list[_Window] = []
+        self._holds: dict[str, _Hold] = {}
+        self._inputs: dict[str, list[tuple[str, Callable[[int], Any]]]] = {}
+        self._watches: list[Watch] = []
+        self._repairs: dict[str, RepairMachine] = {}
+        self._compile()
+        self._broadcasts = self._make_broadcasts() if broadcast else {}
+        self._samplers = self._make_samplers(monitor_ns) if monitor_ns else []
+        self.gate = Gate(catalog, self._sendable())
+
+    # --- inputs -----------------------------------------------------------------------------------------------------------
+
+    def receive(self, frame: Frame) -> Sequence[Output]:
+        """One frame, with everything that was due before it."""
+        return self.receive_many((frame,))
+
+    def receive_many(self, frames: Iterable[tuple[int, int, bytes]]) -> list[Output]:
+        """Frames in order; the same as `receive` for each, without its cost a call."""
+        board, timers = self.board, self.timers
+        get, bind, queued, settle = board.table.get, board.bind, board.queued, board.settle
+        last = self.now_ns
+        if not self._begun:
+            frames, last = self._begin_with(frames)
+        for t, key, data in frames:
+            if t >= timers.next_ns or t < last:
+                if t < last:
+                    self.counters["time stamps that ran backwards"] += 1
+                    t = last
+                self._pass_time(t)
+            last = t
+            page = get(key, _MISSING)
+            if page is None:
+                continue
+            if page is _MISSING:
+                page = bind(key)
+                if page is None:
+                    continue
+            if page.seen != data:
+                page.t_ns = t
+                if page.seen is None:
+                    page.heard()
+                page.data = data
+                page.seen = ALWAYS if page.always else data
+                page.handle(t, data)
+                if queued:
+                    settle(t)
+            else:
+                page.t_ns = t
+        self.now_ns = last
+        return self._take()
+
+    def tick(self, now_ns: int) -> Sequence[Output]:
+        """Time has passed without a frame."""
+        self._advance(now_ns)
+        return self._take()
+
+    def command(self, order: Order, now_ns: int) -> Sequence[Output]:
+        """An order from level 2 or from the machine. Always answered by a `Result`."""
+        self._advance(now_ns)
+        reason = self._obey(order)
+        self.board.settle(self.now_ns)
+        self._out.append(Result(order.id, "refused" if reason else "done", reason))
+        return self._take()
+
+    def next_deadline(self) -> int | None:
+        """When the next `tick` is wanted at the latest, ns; None: never, before a frame comes."""
+        if not self._begun:
+            return self.now_ns if self.now_ns > -FAR else None
+        return self.timers.next_ns if self.timers.next_ns < FAR else None
+
+    def state(self) -> State:
+        """What to store for the next start."""
+        return State(self.mode, tuple(self._memory(alarm) for alarm in self._alarms.values()
+                                      if alarm.state != NORMAL or self._raised[alarm.definition.name] or self._begun_of(alarm)))
+
+    def alarm_states(self) -> dict[str, int]:
+        """Present state of every alarm: 0 Normal, 1 Active, 2 Repairing, 3 LockedOut."""
+        return {name: alarm.state for name, alarm in self._alarms.items()}
+
+    # --- time -------------------------------------------------------------------------------------------------------------
+
+    def _begin_with(self, frames: Iterable[tuple[int, int, bytes]]) -> tuple[Iterable[tuple[int, int, bytes]], int]:
+        rest = iter(frames)
+        first = next(rest, None)
+        if first is None:
+            return (), self.now_ns
+        self._begin(first[0])
+        return chain((first,), rest), self.now_ns
+
+    def _advance(self, now_ns: int) -> None:
+        if not self._begun:
+            self._begin(now_ns)
+        if now_ns < self.now_ns:
+            self.counters["time stamps that ran backwards"] += 1
+            return
+        self._pass_time(now_ns)
+        self.now_ns = now_ns
+
+    def _pass_time(self, now_ns: int) -> None:
+        """Everything due up to now, each at its own time."""
+        while (item := self.timers.pop(now_ns)) is not None:
+            due = self.timers.popped_ns
+            item.expire(due)
+            self.board.settle(due)
+
+    def _begin(self, t_ns: int) -> None:
+        """The first input: the time line begins, and conditions that hold without any frame are told."""
+        self._begun = True
+        if self.now_ns == -FAR:
+            self.now_ns = t_ns
+        start = self.now_ns
+        if self._restored is not None:
+            self._restore(self._restored, start)
+        for watch in self._watches:
+            watch.queued = True
+        self.board.queued.extend(self._watches)
+        self.board.settle(start)
+        for timed in (*self._broadcasts.values(), *self._samplers):
+            self.timers.set(timed, start)
+        if self._broadcasts or self._samplers:
+            self._pass_time(start)
+
+    def _take(self) -> list[Output]:
+        if not self._out:
+            return []
+        out, self._out = self._out, []
+        return out
+
+    # --- building ---------------------------------------------------------------------------------------------------------
+
+    def _compile(self) -> None:
+        board, things = self.board, self._things
+        thresholds = Thresholds(board, things)
+        for expression in self._expressions():
+            thresholds.add(expression)
+        self._use_for_repairs_and_monitoring()
+        board.set_classes(thresholds.constants)
+        board.set_limits()
+        compiler = Compiler(board, things)
+        for name, machine in self._alarms.items():
+            alarm = machine.definition
+            evaluate, cells = compiler.zone(alarm.when, alarm.until, alarm.enabled)
+            self._watch(evaluate, cells, machine.zone_changed, UNTOLD)
+            self._inputs[name] = self._freeze_frame(alarm.when)
+            if alarm.repair is not None:
+                self._compile_repair(machine, alarm.repair, compiler)
+        for (name, window_ns), cell in things.counts.items():
+            self._counts.append(_Window(self, name, window_ns, cell))
+        board.compile()
+
+    def _expressions(self) -> Iterable[Expression]:
+        for alarm in self.catalog.alarms.values():
+            yield from (part for part in (alarm.when, alarm.until, alarm.enabled) if part is not None)
+            if alarm.repair is not None:
+                yield from (step.condition for step in alarm.repair.steps if isinstance(step, ExpectStep))
+
+    def _use_for_repairs_and_monitoring(self) -> None:
+        for alarm in self.catalog.alarms.values():
+            for expression in walk(alarm.when):
+                if isinstance(expression, (SignalValue, Quality)) and expression.signal:
+                    self.board.cell(expression.message, expression.signal)
+        for message in self.catalog.messages.values():
+            if message.monitor_as:
+                for signal in message.signals:
+                    self.board.cell(message.name, signal.name)
+        for name in self._commanded():
+            self.board.page(name)
+
+    def _commanded(self) -> set[str]:
+        """Messages that repairs and commands send."""
+        names = {command.message for command in self.catalog.commands.values()}
+        for alarm in self.catalog.alarms.values():
+            if alarm.repair is not None:
+                names.update(step.message for step in (*alarm.repair.steps, *alarm.repair.give_up)
+                             if isinstance(step, (SendStep, ResendStep)))
+        return names
+
+    def _sendable(self) -> set[str]:
+        return self._commanded() | {alarm.message for alarm in self.catalog.alarms.values()}
+
+    def _watch(self, evaluate: Callable[[], int], cells: Iterable[Cell], sink: Callable[[int, int], None], outcome: int) -> None:
+        watch = Watch(len(self._watches), evaluate, sink, outcome)
+        self._watches.append(watch)
+        for cell in cells:
+            cell.watches.append(watch)
+
+    def _compile_repair(self, machine: AlarmMachine, repair: Repair, compiler: Compiler) -> None:
+        compiled = {position: compiler.verdict(step.condition) for position, step in enumerate(repair.steps)
+                    if isinstance(step, ExpectStep)}
+        expects = {position: evaluate for position, (evaluate, _) in compiled.items()}
+        verdicts = tuple(expects.values())
+
+        def feedback() -> int:
+            """The worst unknown among the expectations, 0 when all are known."""
+            return max((verdict for verdict in (ask() for ask in verdicts) if verdict > Verdict.TRUE), default=0)
+
+        episode = RepairMachine(machine, repair, self, self.timers, expects, feedback)
+        self._repairs[machine.definition.name] = machine.episode = episode
+        self._watch(feedback, dict.fromkeys(cell for _, cells in compiled.values() for cell in cells), episode.feedback_changed, 0)
+        for position, (evaluate, cells) in compiled.items():
+            self._watch(evaluate, cells, _expectation(episode, position), Verdict.FALSE)
+
+    def _freeze_frame(self, when: Expression) -> list[tuple[str, Callable[[int], Any]]]:
+        """What to record when an alarm is raised: every input of its condition, by name."""
+        inputs: dict[str, Callable[[int], Any]] = {}
+        for node in walk(when):
+            match node:
+                case SignalValue(message=message, signal=signal) | Rate(message=message, signal=signal):
+                    cell = self.board.cell(message, signal)
+                    inputs[cell.name] = _reader(self.board, cell)
+                case Quality(message=message, signal=signal) | Elapsed(message=message, signal=signal) if signal:
+                    cell = self.board.cell(message, signal)
+                    inputs[cell.name] = _reader(self.board, cell)
+                case Silent(message=message) | Quality(message=message) | Elapsed(message=message):
+                    inputs[message] = _silence(self.board.page(message))
+                case AlarmState(alarm=alarm):
+                    inputs[alarm] = _state_word(self._alarms[alarm])
+                case Count(alarm=alarm, window_ns=window):
+                    inputs[f"count({alarm})"] = _count(self._things.count(alarm, window))
+                case _:
+                    pass
+        return list(inputs.items())
+
+    def _make_broadcasts(self) -> dict[str, _Broadcast]:
+        names = dict.fromkeys(alarm.message for alarm in self.catalog.alarms.values())
+        return {name: _Broadcast(self, self.catalog.messages[name]) for name in names
+                if self.catalog.messages[name].sent_by_ucs}
+
+    def _make_samplers(self, period_ns: int) -> list[_Sampler]:
+        return [_Sampler(self, message, period_ns) for message in self.catalog.messages.values() if message.monitor_as]
+
+    # --- what alarms and repairs ask for (alarm.Host, repair.Host) ----------------------------------------------------------
+
+    def emit(self, alarm: AlarmMachine, t_ns: int, event: str, text: str = "", attempt: int = 0,
+             frames: tuple[SentFrame, ...] = (), passive: bool = False) -> int:
+        """Report a step upward, always."""
+        self.seq += 1
+        definition = alarm.definition
+        values = {name: read(t_ns) for name, read in self._inputs[definition.name]}
+        self._out.append(Event(
+            self.unit, self.boot, self.seq, seconds(t_ns), self.utc(t_ns), self.utc_trusted, definition.name, definition.code,
+            definition.priority, event, self.seq if event == "raised" else alarm.instance, attempt, values, text, frames, passive))
+        return self.seq
+
+    def utc(self, t_ns: int) -> str | None:
+        """RFC 3339 label of a time, None where no wall clock is known."""
+        if self.utc_offset_ns is None:
+            return None
+        moment = _EPOCH + timedelta(microseconds=(t_ns + self.utc_offset_ns) // 1000)
+        return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+    def moved(self, alarm: AlarmMachine, t_ns: int) -> None:
+        """The state of an alarm has changed: conditions that ask for it, and everyone on the bus, must know."""
+        cell = self._things.alarms.get(alarm.definition.name)
+        if cell is not None:
+            cell.k = alarm.state
+            self.board.queue(cell)
+        broadcast = self._broadcasts.get(alarm.definition.message)
+        if broadcast is not None:
+            broadcast.expire(t_ns)
+
+    def counted(self, alarm: AlarmMachine, t_ns: int) -> None:
+        """An activation more."""
+        self._raised[alarm.definition.name].append(t_ns)
+        for window in self._counts:
+            if window.alarm == alarm.definition.name:
+                window.expire(t_ns)
+
+    def is_armed(self, alarm: AlarmMachine) -> bool:
+        """Whether the configuration lets its repair act."""
+        return self.armed is None or alarm.definition.name in self.armed
+
+    def forbidden(self, repair: Repair) -> str:
+        """Nothing moves while the unit is stopped or paused from above."""
+        return f"the unit is {self.mode} from above" if repair.moves and self.mode != "running" else ""
+
+    def claim(self, owner: RepairMachine, t_ns: int, messages: Sequence[str]) -> str:
+        """Own command messages, all or none; from a repair of lower priority they are taken."""
+        holds = [self._hold(name) for name in messages]
+        for hold in holds:
+            if hold.owner not in (None, owner) and hold.owner is not None and hold.owner.rank >= owner.rank:
+                return hold.owner.alarm.definition.name
+        for hold in holds:
+            if hold.owner is not None and hold.owner is not owner:
+                hold.owner.taken(t_ns, owner.alarm.definition.name)
+            hold.owner = owner
+        return ""
+
+    def release(self, owner: RepairMachine, t_ns: int) -> None:
+        """Hand command messages back, and let those who wait for one try again."""
+        freed = [hold for hold in self._holds.values() if hold.owner is owner]
+        for hold in freed:
+            hold.owner = None
+            hold.due = FAR
+        if freed:
+            self._circumstances_changed(t_ns)
+
+    def transmit(self, owner: RepairMachine, t_ns: int, step: SendStep | ResendStep) -> None:
+        """Send a step's frame now, and go on repeating it at its cycle time while the episode lasts. Raises Refused."""
+        hold = self._hold(step.message)
+        payload = self._payload(step, t_ns)
+        self.send(t_ns, step.message, payload, f"repair of {owner.alarm.definition.name}")
+        hold.payload = payload
+        if hold.message.cycle_ns:
+            self.timers.set(hold, t_ns + hold.message.cycle_ns)
+
+    def preview(self, owner: RepairMachine, steps: Sequence[Step]) -> tuple[SentFrame, ...]:
+        """The frames that steps would send from here, one after the other."""
+        frames = []
+        payloads: dict[str, bytes] = {}
+        for step in steps:
+            if isinstance(step, (SendStep, ResendStep)):
+                message = self.catalog.messages[step.message]
+                base = payloads.get(step.message, self._last_command(step.message))
+                if isinstance(step, SendStep):
+                    base = encode(message, step.values, base)
+                if base is not None:
+                    payloads[step.message] = base
+                    frames.append(SentFrame(step.message, f"{message.can_id:0{8 if message.extended else 3}X}", base.hex().upper()))
+        return tuple(frames)
+
+    # --- sending ----------------------------------------------------------------------------------------------------------
+
+    def send(self, t_ns: int, name: str, payload: bytes, reason: str) -> None:
+        """Hand a frame out through the gate; the board then knows it as the last one commanded. Raises Refused."""
+        expires_ns = self.gate.check(t_ns, name, payload)
+        message = self.catalog.messages[name]
+        for bus in self.catalog.buses.get(name, (0,)):
+            key = frame_key(message.can_id, message.extended, bus)
+            self._out.append(Send(t_ns, key, payload, name, reason, expires_ns))
+        page = self.board.pages.get(name)
+        if page is not None:
+            page.receive(t_ns, payload)
+
+    def _hold(self, name: str) -> _Hold:
+        if name not in self._holds:
+            self._holds[name] = _Hold(self, self.catalog.messages[name])
+        return self._holds[name]
+
+    def _last_command(self, name: str) -> bytes | None:
+        """The payload last commanded by whomever, as long as it still counts; None: nobody commands this now."""
+        page = self.board.page(name)
+        if page.level < 0 or (page.stale_level and page.level >= page.stale_level) or len(page.data) != page.message.length:
+            return None
+        return page.data
+
+    def _payload(self, step: SendStep | ResendStep, t_ns: int) -> bytes:
+        last = self._last_command(step.message)
+        if isinstance(step, SendStep):
+            return encode(self.catalog.messages[step.message], step.values, last)
+        if last is None:
+            raise Refused(f"nobody has commanded {step.message} lately: there is nothing to send again")
+        return last
+
+    # --- commands ---------------------------------------------------------------------------------------------------------
+
+    def _obey(self, order: Order) -> str:
+        """Carry an order out; gives the reason of a refusal."""
+        if order.name in ("acknowledge", "reset"):
+            return self._people(order)
+        command = self.catalog.commands.get(order.name)
+        if order.name not in ("pause", "resume", "stop") and command is None:
+            return f"unknown command {order.name}"
+        if order.name == "resume" and self.mode == "stopped" and order.origin == "above":
+            return "the unit was stopped: it is started again at the machine"
+        if command is not None:
+            try:
+                self.send(self.now_ns, command.message, self._command_payload(command, order), f"command {order.name}")
+            except (Refused, ValueError) as refusal:
+                return str(refusal)
+        modes = {"pause": "paused" if self.mode == "running" else self.mode, "stop": "stopped", "resume": "running"}
+        mode = modes.get(order.name, self.mode)
+        if mode != self.mode:
+            self.mode = mode
+            self._circumstances_changed(self.now_ns)
+        return ""
+
+    def _people(self, order: Order) -> str:
+        who = order.origin
+        if order.name == "acknowledge" and not order.target:
+            for alarm in self._alarms.values():
+                if alarm.state != NORMAL:
+                    alarm.acknowledge(self.now_ns, who)
+            return ""
+        machine = self._alarms.get(order.target)
+        if machine is None:
+            return f"unknown alarm {order.target}"
+        if order.name == "acknowledge":
+            return machine.acknowledge(self.now_ns, who)
+        repair = machine.definition.repair
+        if order.origin == "above" and (repair is None or repair.local_reset):
+            return f"{order.target} can only be reset at the machine"
+        return machine.reset(self.now_ns, who)
+
+    def _command_payload(self, command: Command, order: Order) -> bytes:
+        message = self.catalog.messages[command.message]
+        hold = self._holds.get(command.message)
+        if hold is not None and hold.owner is not None:
+            raise Refused(f"{command.message} belongs to the repair of {hold.owner.alarm.definition.name} now")
+        raws: dict[str, int] = {}
+        for name, raw in command.values.items():
+            if raw is not None:
+                raws[name] = raw
+                continue
+            if order.value is None:
+                raise Refused(f"{order.name} needs a value")
+            signal = message.signal(name)
+            exact = (Fraction(order.value) - Fraction(signal.offset)) / Fraction(signal.factor)
+            raws[name] = round(exact)
+        return encode(message, raws, self._last_command(command.message))
+
+    def _circumstances_changed(self, t_ns: int) -> None:
+        ranked = sorted(self._repairs.values(), key=lambda repair: -repair.rank)
+        for repair in ranked:
+            repair.circumstances_changed(t_ns)
+
+    # --- restart ----------------------------------------------------------------------------------------------------------
+
+    def _begun_of(self, alarm: AlarmMachine) -> list[int]:
+        repair = self._repairs.get(alarm.definition.name)
+        return repair.begun_ns if repair is not None else []
+
+    def _memory(self, alarm: AlarmMachine) -> AlarmMemory:
+        name = alarm.definition.name
+        repair = self._repairs.get(name)
+        now = self.now_ns
+        return AlarmMemory(name, alarm.state, alarm.instance, alarm.acknowledged, repair.attempt if repair is not None else 0,
+                           tuple(now - begun for begun in self._begun_of(alarm)), tuple(now - raised for raised in self._raised[name]))
+
+    def _restore(self, state: State, now_ns: int) -> None:
+        for memory in state.alarms:
+            machine = self._alarms.get(memory.name)
+            if machine is None:
+                self.counters["remembered alarms that are defined no more"] += 1
+                continue
+            self._raised[memory.name].extend(now_ns - ago for ago in memory.raised_ago_ns)
+            machine.state = memory.state
+            machine.zone = Zone.STALE
+            machine.instance = memory.instance
+            machine.acknowledged = memory.acknowledged
+            repair = self._repairs.get(memory.name)
+            if repair is not None:
+                repair.restore(now_ns, memory.attempt, [now_ns - ago for ago in memory.begun_ago_ns])
+            elif machine.state in (REPAIRING, LOCKED_OUT):
+                machine.state = ACTIVE
+            self.moved(machine, now_ns)
+        for window in self._counts:
+            window.expire(now_ns)
+
+
+class _Window:
+    """`count(Alarm, window)`: falls by one exactly when an activation leaves the window."""
+
+    def __init__(self, supervisor: Supervisor, alarm: str, window_ns: int, cell: Cell):
+        self.supervisor = supervisor
+        self.alarm = alarm
+        self.window_ns = window_ns
+        self.cell = cell
+        self.order = supervisor.timers.order()
+        self.due = FAR
+
+    def expire(self, now_ns: int) -> None:
+        """An activation has come, or one may have left."""
+        supervisor = self.supervisor
+        inside = [raised for raised in supervisor._raised[self.alarm] if raised + self.window_ns > now_ns]
+        if len(inside) != self.cell.value:
+            self.cell.value = len(inside)
+            supervisor.board.queue(self.cell)
+        longest = max(window.window_ns for window in supervisor._counts if window.alarm == self.alarm)
+        raised = supervisor._raised[self.alarm]
+        while raised and raised[0] + longest <= now_ns:
+            raised.popleft()
+        if inside:
+            supervisor.timers.set(self, inside[0] + self.window_ns)
+
+
+class _Hold:
+    """A command message while a repair owns it: repeated at its cycle time."""
+
+    def __init__(self, supervisor: Supervisor, message: Message):
+        self.supervisor = supervisor
+        self.message = message
+        self.order = supervisor.timers.order()
+        self.due = FAR
+        self.owner: RepairMachine | None = None
+        self.payload = b""
+
+    def expire(self, now_ns: int) -> None:
+        """Repeat it."""
+        if self.owner is None or not self.message.cycle_ns:
+            return
+        supervisor = self.supervisor
+        supervisor.timers.set(self, now_ns + self.message.cycle_ns)
+        try:
+            supervisor.send(now_ns, self.message.name, self.payload, f"held by the repair of {self.owner.alarm.definition.name}")
+        except Refused:
+            supervisor.counters["frames refused by the gate"] += 1
+
+
+class _Broadcast:
+    """An alarm message on the bus: at every change and at its cycle time."""
+
+    def __init__(self, supervisor: Supervisor, message: Message):
+        self.supervisor = supervisor
+        self.message = message
+        self.order = supervisor.timers.order()
+        self.due = FAR
+        self.alarms = [alarm for alarm in supervisor._alarms.values() if alarm.definition.message == message.name]
+
+    def expire(self, now_ns: int) -> None:
+        """Send it as it is now."""
+        supervisor = self.supervisor
+        payload = encode(self.message, {alarm.definition.name: alarm.state for alarm in self.alarms})
+        try:
+            supervisor.send(now_ns, self.message.name, payload, "alarm states")
+        except Refused:
+            supervisor.counters["frames refused by the gate"] += 1
+        if self.message.cycle_ns:
+            supervisor.timers.set(self, now_ns + self.message.cycle_ns)
+
+
+class _Sampler:
+    """A monitoring message, sampled at a fixed rate without drift."""
+
+    def __init__(self, supervisor: Supervisor, message: Message, period_ns: int):
+        self.supervisor = supervisor
+        self.message = message
+        self.period_ns = period_ns
+        self.order = supervisor.timers.order()
+        self.due = FAR
+        self.cells = [(signal.name, supervisor.board.cell(message.name, signal.name)) for signal in message.signals]
+
+    def expire(self, now_ns: int) -> None:
+        """Take a sample of all values, each with its age and quality."""
+        supervisor = self.supervisor
+        values: dict[str, Any] = {}
+        ages: dict[str, float | None] = {}
+        quality: dict[str, str] = {}
+        for name, cell in self.cells:
+            raw, grade = supervisor.board.sample(cell)
+            values[name] = physical(cell, raw) if raw is not None and grade == GOOD else None
+            ages[name] = None if cell.page.level < 0 else (now_ns - cell.page.t_ns) / 1e9
+            quality[name] = QUALITY_WORDS[grade]
+        supervisor._out.append(Monitor(supervisor.unit, supervisor.boot, seconds(now_ns), supervisor.utc(now_ns),
+                                       supervisor.utc_trusted, self.message.monitor_as, values, ages, quality))
+        supervisor.timers.set(self, now_ns + self.period_ns)
+
+
+def physical(cell: Cell, raw: RawValue) -> int | float | str:
+    """A raw value for people: its name in the value table, else the physical value."""
+    if isinstance(raw, int) and raw in cell.signal.choices:
+        return cell.signal.choices[raw]
+    return cell.scale.physical(raw)
+
+
+def _reader(board: Board, cell: Cell) -> Callable[[int], Any]:
+    def read(t_ns: int) -> Any:
+        raw, quality = board.sample(cell)
+        return physical(cell, raw) if quality == GOOD and raw is not None else QUALITY_WORDS[quality]
+    return read
+
+
+def _silence(page: Page) -> Callable[[int], Any]:
+    def read(t_ns: int) -> Any:
+        return "never" if page.level < 0 else f"last received {(t_ns - page.t_ns) / 1e9:.3f} s ago"
+    return read
+
+
+def _state_word(machine: AlarmMachine) -> Callable[[int], Any]:
+    def read(t_ns: int) -> Any:
+        return STATE_WORDS[machine.state]
+    return read
+
+
+def _count(cell: Cell) -> Callable[[int], Any]:
+    def read(t_ns: int) -> Any:
+        return cell.value
+    return read
+
+
+def _expectation(episode: RepairMachine, position: int) -> Callable[[int, int], None]:
+    def sink(t_ns: int, verdict: int) -> None:
+        episode.expectation_changed(t_ns, position, verdict)
+    return sink
+
+
+__all__ = ["EXTENDED", "Alarm", "AlarmMemory", "State", "Supervisor"]
