@@ -17,13 +17,10 @@ from typing import Any
 
 from level1.catalog import STALE_CYCLES, Catalog, Message, Signal
 from level1.decode import (
-    CORRUPT,
-    ERROR,
     GOOD,
     NEVER,
     OLD,
     SHORT,
-    UNAVAILABLE,
     Classes,
     RawValue,
     Scale,
@@ -500,4 +497,3 @@ def _index(watch: Watch) -> int:
     return watch.index
 
 
-__all__ = ["ALWAYS", "CORRUPT", "ERROR", "GOOD", "NEVER", "OLD", "SHORT", "UNAVAILABLE", "Board", "Cell", "Held", "Page", "Rate", "Watch"]

@@ -31,8 +31,8 @@ from level1.expression import (
     Or,
     Quality,
     Rate,
-    Silent,
     SignalValue,
+    Silent,
     TroubleCode,
 )
 
@@ -226,13 +226,14 @@ class Compiler:
         self.cells = []
         return self._function([f" return {self.boolean(expression)}"]), tuple(dict.fromkeys(self.cells))
 
-    def zone(self, when: Expression, until: Expression | None, enabled: Expression | None) -> tuple[Callable[[], int], tuple[Cell, ...]]:
+    def zone(self, when: Expression, until: Expression | None,
+             enabled: Expression | None) -> tuple[Callable[[], int], tuple[Cell, ...]]:
         """A closure that gives the present `Zone` of an alarm, and the cells whose moves may change it."""
         self.cells = []
         lines = []
         if enabled is not None:
             lines += [f" e = {self.boolean(enabled)}", f" if e != {T}: return e"]
-        lines += [f" w = {self.boolean(when)}", f" if w: return w"]
+        lines += [f" w = {self.boolean(when)}", " if w: return w"]
         if until is not None:
             lines += [f" return {Zone.CLEAR.value} if {self.boolean(until)} == {T} else {Zone.NEITHER.value}"]
         else:

@@ -186,7 +186,8 @@ def encode(message: Message, values: Mapping[str, int], base: bytes | None = Non
     """
     payload = bytearray(base if base is not None else bytes(message.length))
     if base is None:
-        values = {signal.name: signal.initial_raw for signal in message.signals if not signal.multiplexer_ids} | dict(values)
+        initial = {signal.name: signal.initial_raw for signal in message.signals if not signal.multiplexer_ids}
+        values = initial | dict(values)
     for name, raw in values.items():
         _insert(payload, message.signal(name), raw)
     return bytes(payload)

@@ -77,7 +77,11 @@ class Result(msgspec.Struct, frozen=True):
 
 
 class Monitor(msgspec.Struct, frozen=True):
-    """A monitoring message: state, never an alarm (SPEC §3). values: number, value-table name or None; age_s per value; quality per value."""
+    """A monitoring message: state, never an alarm (SPEC §3).
+
+    values: number, value-table name, or None where the sample is not good; age_s: seconds since it was received, None before
+    that; quality: a word of `decode.QUALITY_WORDS`.
+    """
 
     unit: str
     boot: int

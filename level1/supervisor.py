@@ -17,16 +17,29 @@ import msgspec
 
 from level1.alarm import AlarmMachine
 from level1.board import ALWAYS, Board, Cell, Page, Watch
-from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Alarm, Catalog, Command, Message, Repair
+from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Catalog, Command, Message, Repair
 from level1.command import Order
 from level1.condition import Compiler, Things, Thresholds, Verdict, Zone, walk
 from level1.decode import GOOD, QUALITY_WORDS, RawValue, encode
 from level1.event import Event, Monitor, Output, Result, Send, SentFrame, seconds
-from level1.expression import AlarmState, Count, Elapsed, ExpectStep, Expression, Quality, Rate, ResendStep, SendStep, SignalValue, Silent, Step
-from level1.frame import EXTENDED, Frame, frame_key
+from level1.expression import (
+    AlarmState,
+    Count,
+    Elapsed,
+    ExpectStep,
+    Expression,
+    Quality,
+    Rate,
+    ResendStep,
+    SendStep,
+    SignalValue,
+    Silent,
+    Step,
+)
+from level1.frame import Frame, frame_key
 from level1.gate import Gate, Refused
 from level1.repair import RepairMachine
-from level1.timer import FAR, Timers
+from level1.timer import FAR, Timed, Timers
 
 STATE_WORDS = ("Normal", "Active", "Repairing", "LockedOut")
 UNTOLD = -1
@@ -203,9 +216,10 @@ class Supervisor:
             watch.queued = True
         self.board.queued.extend(self._watches)
         self.board.settle(start)
-        for timed in (*self._broadcasts.values(), *self._samplers):
+        cyclic: list[Timed] = [*self._broadcasts.values(), *self._samplers]
+        for timed in cyclic:
             self.timers.set(timed, start)
-        if self._broadcasts or self._samplers:
+        if cyclic:
             self._pass_time(start)
 
     def _take(self) -> list[Output]:
@@ -513,7 +527,8 @@ class Supervisor:
         repair = self._repairs.get(name)
         now = self.now_ns
         return AlarmMemory(name, alarm.state, alarm.instance, alarm.acknowledged, repair.attempt if repair is not None else 0,
-                           tuple(now - begun for begun in self._begun_of(alarm)), tuple(now - raised for raised in self._raised[name]))
+                           tuple(now - begun for begun in self._begun_of(alarm)),
+                           tuple(now - raised for raised in self._raised[name]))
 
     def _restore(self, state: State, now_ns: int) -> None:
         for memory in state.alarms:
@@ -672,4 +687,3 @@ def _expectation(episode: RepairMachine, position: int) -> Callable[[int, int], 
     return sink
 
 
-__all__ = ["EXTENDED", "Alarm", "AlarmMemory", "State", "Supervisor"]
