@@ -21,6 +21,7 @@ from level1.io.error import OutsideError, did_you_mean
 
 UNITS_NS = {"us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "min": 60_000_000_000, "h": 3_600_000_000_000}
 SCHEMES = ("mqtt", "mqtts")
+SHORTEST_PERIOD_NS, LONGEST_PERIOD_NS = 10_000_000, 60_000_000_000
 _DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)")
 _TOPIC_LEVEL = re.compile(r"[^\s/+#$][^\s/+#]*")
 _KINDS = {str: "a text", int: "a whole number", bool: "true or false", float: "a number", dict: "a table"}
@@ -38,7 +39,7 @@ class Unit(msgspec.Struct, frozen=True):
 
 
 class Bus(msgspec.Struct, frozen=True):
-    """A CAN bus. interface, channel, bitrate, fd: as python-can takes them; options: further arguments of the interface.
+    """A CAN bus. interface, channel, bitrate, fd: as python-can takes them; options: further arguments of it.
 
     dbc: files bound to this bus; a name that is no file beside the configuration is one of the shipped definitions.
     """
@@ -143,7 +144,8 @@ def duration_ns(text: str) -> int:
     """Nanoseconds of a duration with its unit, such as `250 ms`. Raises ValueError with what to write instead."""
     match = _DURATION.fullmatch(text.strip())
     if not match or match[2] not in UNITS_NS:
-        raise ValueError(f'"{text}" is no duration; write a number and a unit ({", ".join(UNITS_NS)}), such as "250 ms"')
+        units = ", ".join(UNITS_NS)
+        raise ValueError(f'"{text}" is no duration; write a number and a unit ({units}), such as "250 ms"')
     whole, _, fraction = match[1].partition(".")
     return int(whole + fraction) * UNITS_NS[match[2]] // int(10 ** len(fraction))
 
@@ -216,13 +218,15 @@ def _rule_problems(table: Mapping[str, Any]) -> Iterator[str]:
     for key in ("name", "fleet"):
         name = unit.get(key)
         if isinstance(name, str) and not _TOPIC_LEVEL.fullmatch(name):
-            yield f'unit.{key}: "{name}" can\'t stand in an MQTT topic; use letters, digits and "-", no space, "/", "+", "#"'
+            yield (f'unit.{key}: "{name}" can\'t stand in an MQTT topic; '
+                   'leave out spaces, "/", "+", "#" and a "$" at the start')
     yield from _bus_problems(table.get("bus"))
     broker = bridge.get("broker")
     if isinstance(broker, str) and (problem := _broker_problem(broker)):
         yield f'bridge.broker: "{broker}" {problem}; write "mqtt://host:1883" or "mqtts://host:8883"'
     period = bridge.get("period")
-    if isinstance(period, str) and not list(_duration_problems(period, "")) and not 10**7 <= duration_ns(period) <= 6 * 10**10:
+    if (isinstance(period, str) and not list(_duration_problems(period, ""))
+            and not SHORTEST_PERIOD_NS <= duration_ns(period) <= LONGEST_PERIOD_NS):
         yield f'bridge.period: "{period}" is outside 10 ms to 1 min'
     baud = gnss.get("baud")
     if isinstance(baud, int) and not 1200 <= baud <= 4_000_000:
@@ -235,13 +239,20 @@ def _bus_problems(buses: Any) -> Iterator[str]:
     if not buses:
         yield "bus: no bus; add a [[bus]] table with name, channel and dbc"
     tables = [bus if isinstance(bus, Mapping) else {} for bus in buses]
-    names = Counter(str(bus.get("name")) for bus in tables if "name" in bus)
-    wires = Counter((str(bus.get("interface", "socketcan")), str(bus.get("channel"))) for bus in tables if "channel" in bus)
-    yield from (f'bus: {count} buses are called "{name}"; give each its own name' for name, count in names.items() if count > 1)
-    yield from (f'bus: {count} buses use the {wire[0]} channel "{wire[1]}"; join their dbc lists' for wire, count in wires.items()
-                if count > 1)
+    for name, count in Counter(str(bus.get("name")) for bus in tables if "name" in bus).items():
+        if count > 1:
+            yield f'bus: {count} buses are called "{name}"; give each its own name'
+    wires = Counter((bus.get("interface", "socketcan"), bus.get("channel")) for bus in tables if _hashable(bus))
+    for (interface, channel), count in wires.items():
+        if count > 1:
+            yield f'bus: {count} buses use the {interface} channel "{channel}"; join their dbc lists'
     if buses and not any(bus.get("dbc") for bus in tables):
         yield 'bus[0].dbc: no bus has definitions; name the DBC files, such as dbc = ["flaming_tool.dbc"]'
+
+
+def _hashable(bus: Mapping[str, Any]) -> bool:
+    """Whether its interface and channel are texts, so that buses can be compared."""
+    return isinstance(bus.get("interface", ""), str) and isinstance(bus.get("channel"), str)
 
 
 def _broker_problem(url: str) -> str:
@@ -262,8 +273,8 @@ def _plain(value: Any, kind: Any) -> Any:
     kind = _without_none(kind)
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         fields = _fields(kind)
-        return {fields[key].name: duration_ns(item) if fields[key].name.endswith("_ns") else _plain(item, fields[key].type)
-                for key, item in value.items()}
+        return {name: duration_ns(item) if name.endswith("_ns") else _plain(item, fields[key].type)
+                for key, item in value.items() for name in [fields[key].name]}
     if get_origin(kind) is tuple:
         return [_plain(item, get_args(kind)[0]) for item in value]
     return value

@@ -2,7 +2,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from difflib import get_close_matches
+
+from level1.similar import closest
 
 
 class OutsideError(Exception):
@@ -16,8 +17,6 @@ class OutsideError(Exception):
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """`; did you mean "channel"?`, or the names there are when none is close, or nothing when there are none."""
     names = sorted(known)
-    by_lower = {name.lower(): name for name in names}
-    close = get_close_matches(word.lower(), by_lower, n=1, cutoff=0.5)
-    if close:
-        return f'; did you mean "{by_lower[close[0]]}"?'
+    if match := closest(word, names):
+        return f'; did you mean "{match}"?'
     return f"; known: {', '.join(names)}" if names else ""

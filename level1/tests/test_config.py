@@ -79,14 +79,17 @@ def test_paths_count_from_the_folder_of_the_file(tmp_path: Path) -> None:
     ("baud = 115200", 'baud = "fast"', "gnss.baud: expected a whole number, found a text ('fast')"),
     ("baud = 115200", "baud = true", "gnss.baud: expected a whole number, found true or false (True)"),
     ("baud = 115200", "baud = 1", "gnss.baud: 1 is outside 1200 to 4000000 bit/s"),
-    ('["NozzlesNotSet"]', '"NozzlesNotSet"', "repairs.armed: expected a list such as [\"…\", \"…\"], found a text ('NozzlesNotSet')"),
+    ('["NozzlesNotSet"]', '"NozzlesNotSet"',
+     "repairs.armed: expected a list such as [\"…\", \"…\"], found a text ('NozzlesNotSet')"),
     ('["NozzlesNotSet"]', "[3]", "repairs.armed[0]: expected a text, found a whole number (3)"),
     ("[[bus]]", "[bus]", "bus: expected [[bus]] tables, found a table"),
-    ('"250 ms"', "250", 'bridge.period: expected a duration with its unit, such as "250 ms", found a whole number (250)'),
-    ('"250 ms"', '"250"', 'bridge.period: "250" is no duration; write a number and a unit (us, ms, s, min, h), such as "250 ms"'),
+    ('"250 ms"', "250",
+     'bridge.period: expected a duration with its unit, such as "250 ms", found a whole number (250)'),
+    ('"250 ms"', '"250"',
+     'bridge.period: "250" is no duration; write a number and a unit (us, ms, s, min, h), such as "250 ms"'),
     ('"250 ms"', '"1 h"', 'bridge.period: "1 h" is outside 10 ms to 1 min'),
     ('name = "tractor-7"', 'name = "tractor 7"',
-     'unit.name: "tractor 7" can\'t stand in an MQTT topic; use letters, digits and "-", no space, "/", "+", "#"'),
+     'unit.name: "tractor 7" can\'t stand in an MQTT topic; leave out spaces, "/", "+", "#" and a "$" at the start'),
     ("mqtts://level2.local:8883", "level2.local",
      'bridge.broker: "level2.local" is no MQTT address; write "mqtt://host:1883" or "mqtts://host:8883"'),
     ("mqtts://level2.local:8883", "mqtt://host:99999999",
@@ -126,7 +129,8 @@ def test_a_folder_and_a_binary_file_say_so(tmp_path: Path) -> None:
 
 
 def test_broken_toml_names_the_line(tmp_path: Path) -> None:
-    assert problems(tmp_path, "[unit\n") == ["not TOML: Expected ']' at the end of a table declaration (at line 1, column 6)"]
+    assert problems(tmp_path, "[unit\n") == [
+        "not TOML: Expected ']' at the end of a table declaration (at line 1, column 6)"]
 
 
 @pytest.mark.parametrize(("text", "expected"), [
