@@ -1,0 +1,56 @@
+# make demo: the whole chain without hardware.   make test: every check.   Both do all set-up themselves.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+WHEEL_VENV := .venv-wheel
+PACKAGES := level1 bridge firmware_py dbc level2 ucs
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.PHONY: help demo test check test-wheel clean packages packages-vcan
+
+help:
+	@echo "make demo        simulated tractor and implements, faults, repairs, level 2: about a minute"
+	@echo "make test        ruff, mypy, import rules, all tests (those on virtual CAN buses too)"
+	@echo "make check       ruff, mypy and import rules only"
+	@echo "make test-wheel  the unit tests against the built and installed wheel"
+	@echo "make clean       remove what these made"
+
+demo: $(VENV)/ready
+	$(BIN)/ucs demo
+
+test: packages-vcan check
+	$(BIN)/python -m pytest
+
+check: $(VENV)/ready
+	$(BIN)/ruff check
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+
+# The packages as a user gets them, with their tests laid beside them; nothing is imported from this folder.
+test-wheel: $(VENV)/ready
+	rm -rf dist $(WHEEL_VENV)
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	$(PYTHON) -m venv $(WHEEL_VENV)
+	$(WHEEL_VENV)/bin/python -m pip install --quiet "$$(ls dist/*.whl)[unit]"
+	site=$$($(WHEEL_VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') && \
+	for package in $(PACKAGES); do \
+	    if [ -d $$package/tests ]; then cp -r $$package/tests $$site/$$package/; fi; \
+	done && \
+	cp pyproject.toml $$site/ && cd $$site && \
+	$(CURDIR)/$(WHEEL_VENV)/bin/python -m pytest -q -m "not vcan" -p no:cacheprovider \
+	    $$(for package in $(PACKAGES); do if [ -d $$package/tests ]; then echo $$package/tests; fi; done)
+
+clean:
+	rm -rf $(VENV) $(WHEEL_VENV) dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+
+packages:
+	@PYTHON="$(PYTHON)" .ci/system-packages
+
+packages-vcan:
+	@PYTHON="$(PYTHON)" .ci/system-packages vcan
+
+# Made anew only when pyproject.toml changes: the packages themselves are used in place.
+$(VENV)/ready: pyproject.toml | packages
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --editable '.[test]'
+	@touch $@

@@ -1,0 +1,190 @@
+"""Tests marked `vcan` need vcan0 and vcan1; where this machine has none, they run in a guest that has.
+
+Theory of operation. The other tests run here, natively. Then the same pytest command runs once more under
+`hil_tests/vcan_run.py`, restricted to the `vcan` tests selected here; it hands each report over as it comes and they are
+taken in as if the tests had run here: one summary, one exit status, and `-x`, `-k`, `--lf`, `--junitxml` do what they always
+do. A `vcan` test for which no report came (the guest died, ran out of time, could not collect it) is an error. Without a way
+to a vcan the run ends at once with exit status 125 and the packages to install; nothing is skipped.
+"""
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil_tests import vcan_run
+
+SELECTED = "VCAN_RUN_SELECTED"
+"""Environment of the guest's pytest: the file that lists the node ids to run."""
+MARK = "\x1e"
+"""Starts and ends a line of the guest's output that is one message as JSON."""
+TIMEOUT_S = 840
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """In the guest: run what was selected outside, and hand the reports over."""
+    listed = os.environ.pop(SELECTED, "")
+    if listed:
+        config.pluginmanager.register(GuestSide(config, Path(listed).read_text().splitlines()))
+
+
+def pytest_report_collectionfinish(items: list[pytest.Item]) -> str | None:
+    """Say where the `vcan` tests run."""
+    count = sum(needs_vcan(item) for item in items)
+    return f"{count} of them need vcan0 and run {vcan_run.way()}" if count else None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtestloop(session: pytest.Session) -> Generator[None, object, object]:
+    """Run the tests that need no vcan here, then the others in the guest."""
+    everything = list(session.items)
+    elsewhere = [item for item in everything if needs_vcan(item)]
+    if not elsewhere or session.config.option.collectonly or vcan_run.present():
+        return (yield)
+    if obstacle := vcan_run.obstacle():
+        pytest.exit(f"{len(elsewhere)} tests need vcan0: {obstacle}", returncode=vcan_run.NO_WAY)
+    session.items[:] = [item for item in everything if not needs_vcan(item)]
+    try:
+        result = yield
+        Guest(session, elsewhere).run()
+    finally:
+        session.items[:] = everything
+    return result
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """One line of what became of the `vcan` tests; `.ci/run` reads it."""
+    counts = {outcome: sum("vcan" in getattr(report, "keywords", ()) for report in reports)
+              for outcome, reports in terminalreporter.stats.items() if outcome not in ("", "deselected")}
+    if any(counts.values()):
+        terminalreporter.write_line(
+            "vcan tests: " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count))
+
+
+def needs_vcan(item: pytest.Item) -> bool:
+    """Whether the test is marked `vcan`."""
+    return item.get_closest_marker("vcan") is not None
+
+
+class Guest:
+    """The run of the `vcan` tests under `vcan_run`, as seen from outside."""
+
+    def __init__(self, session: pytest.Session, items: list[pytest.Item]):
+        self.session, self.config, self.items = session, session.config, items
+        self.waiting = {item.nodeid: item for item in items}
+        self.output: list[str] = []
+
+    def run(self) -> None:
+        """Run them; their reports are taken in as they come. Raises what ends a session early (`-x`, Ctrl-C)."""
+        with tempfile.TemporaryDirectory(prefix="vcan-tests-") as job, self._start(Path(job)) as lines:
+            for line in lines:
+                if line.startswith(MARK):
+                    self._take(json.loads(line.strip(MARK + "\r\n")))
+                else:
+                    self._keep(line)
+        if not self.session.shouldfail and not self.session.shouldstop:
+            self._blame()
+        self._stop_if_asked()
+
+    @contextlib.contextmanager
+    def _start(self, job: Path) -> Iterator[Iterator[str]]:
+        """The lines that the guest's pytest writes; at the end its exit status is kept in `self.status`."""
+        selected = job / "selected"
+        selected.write_text("\n".join(self.waiting))
+        parameters = self.config.invocation_params
+        command = [sys.executable, vcan_run.__file__, "-t", str(TIMEOUT_S), sys.executable, "-m", "pytest",
+                   *map(str, parameters.args), "-o", f"cache_dir={job / 'cache'}"]
+        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                              cwd=parameters.dir, env={**os.environ, SELECTED: str(selected)}, text=True,
+                              errors="backslashreplace", bufsize=1) as runner:
+            assert runner.stdout is not None
+            try:
+                yield iter(runner.stdout)
+            except BaseException:
+                runner.terminate()
+                raise
+        self.status = runner.returncode
+
+    def _take(self, message: dict[str, Any]) -> None:
+        """One message of the guest: a test started, a report, a test finished."""
+        hook = self.config.hook
+        item = self.waiting.get(message["nodeid"])
+        if item is None:
+            return
+        if "report" in message:
+            report = hook.pytest_report_from_serializable(config=self.config, data=message["report"])
+            report.location = item.location
+            if isinstance(report.longrepr, list):  # of a skip: JSON knows no tuples
+                report.longrepr = tuple(report.longrepr)
+            hook.pytest_runtest_logreport(report=report)
+        elif message["step"] == "start":
+            hook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+        else:
+            hook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+            del self.waiting[item.nodeid]
+
+    def _keep(self, line: str) -> None:
+        """What the guest printed besides: shown with `-s`, else only if a test got lost."""
+        if self.config.option.capture == "no":
+            sys.stdout.write(line)
+        self.output.append(line)
+
+    def _blame(self) -> None:
+        """Every test that did not finish is an error, with what the guest said last."""
+        reason = {vcan_run.TIMED_OUT: f"ran out of time ({TIMEOUT_S} s)"}.get(self.status, f"ended, status {self.status}")
+        text = f"the guest {reason} before this test had finished; its last words:\n{''.join(self.output[-200:])}"
+        hook = self.config.hook
+        for item in self.waiting.values():
+            report = pytest.TestReport(item.nodeid, item.location, dict.fromkeys(item.keywords, 1), "failed", text, "setup")
+            hook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+            hook.pytest_runtest_logreport(report=report)
+            hook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+
+    def _stop_if_asked(self) -> None:
+        if self.session.shouldfail:
+            raise self.session.Failed(self.session.shouldfail)
+        if self.session.shouldstop:
+            raise self.session.Interrupted(self.session.shouldstop)
+
+
+class GuestSide:
+    """In the guest: collect only what was selected outside, and write each report to standard output."""
+
+    def __init__(self, config: pytest.Config, selected: list[str]):
+        self.config, self.selected = config, set(selected)
+        self.files = {config.rootpath / nodeid.partition("::")[0] for nodeid in selected}
+        self.out = os.fdopen(os.dup(1), "w")
+
+    def pytest_ignore_collect(self, collection_path: Path) -> bool | None:
+        """Leave files alone that have none of the selected tests."""
+        return True if collection_path.is_file() and collection_path not in self.files else None
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Keep the selected tests."""
+        items[:] = [item for item in items if item.nodeid in self.selected]
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """A test starts."""
+        self._send({"nodeid": nodeid, "step": "start"})
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """A phase of a test ended."""
+        data = self.config.hook.pytest_report_to_serializable(config=self.config, report=report)
+        self._send({"nodeid": report.nodeid, "report": data})
+
+    def pytest_runtest_logfinish(self, nodeid: str) -> None:
+        """A test ended."""
+        self._send({"nodeid": nodeid, "step": "finish"})
+
+    def _send(self, message: dict[str, Any]) -> None:
+        self.out.write(f"\n{MARK}{json.dumps(message)}{MARK}\n")
+        self.out.flush()
