@@ -1,0 +1,336 @@
+"""The journal: every event on the disk before anything else happens with it (DESIGN §6).
+
+SQLite in WAL mode with `synchronous=FULL`: a commit survives the power cut right after it. One connection writes, owned
+by one thread; readers have read-only connections of their own and disturb nobody.
+
+The thread is there for slow disks: `append` waits for the commit as long as `patience_ns`, then supervision goes on and
+the events wait in memory. The same holds for a full, read-only or broken disk: `fault` says so, the thread tries again,
+and what waited is written in order as soon as it can be. Nothing here raises for disk trouble after the opening.
+
+Beside `journal.db` stand `journal.db.boot` (the boot id, in case the journal is lost), `journal.db.ballast` (space for
+alarms on a full disk) and `journal.db.lock` (one writer).
+"""
+from __future__ import annotations
+
+import fcntl
+import os
+import sqlite3
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+from level1.event import Event
+from level1.io.ballast import Ballast
+from level1.io.bootfile import BootFile
+from level1.io.journal_file import (
+    FIRST,
+    JournalError,
+    JournalFile,
+    Position,
+    beside,
+    cannot_write,
+    code,
+    is_corrupt,
+    set_aside,
+)
+from level1.io.journal_reader import Reader, read_events
+
+__all__ = ["FIRST", "Journal", "JournalError", "Position", "Reader", "read_events"]
+
+QUEUE_EVENTS = 10_000
+"""Events that wait in memory at most (about 10 MB); beyond it the oldest are lost and counted."""
+KEEP_BYTES = 256 << 20
+"""Size from which `prune` drops events: a few hundred thousand."""
+PATIENCE_NS = 250_000_000
+"""How long `append` waits for the disk: well within the 1 s in which a gas valve has to close (DESIGN §5)."""
+RETRY_S = 1.0
+"""Pause before another try while something is wrong; each `append` is a try too."""
+DROP_EVENTS = 500
+"""Events dropped in one transaction."""
+
+
+class Journal:
+    """The writer's side; a context manager. Opening raises JournalError when `path` can't be written.
+
+    boot: id of this opening; higher than every earlier one, on the disk before it is given, never given again.
+    new_boot: the boot id to begin with where nothing is left of an earlier journal, not even the boot file: with an
+    exchanged card an old unit would begin at 1 again, with the seconds of a wall clock it would not.
+    """
+
+    def __init__(self, path: Path, unit: str, *, new_boot: int = 1, queue_events: int = QUEUE_EVENTS,
+                 keep_bytes: int = KEEP_BYTES, patience_ns: int = PATIENCE_NS):
+        self.path = Path(path).absolute()
+        self.unit = unit
+        self._lock = _locked(self.path)
+        self._queue_events, self._keep_bytes, self._patience_ns = queue_events, keep_bytes, patience_ns
+        self._queue: deque[Event] = deque()
+        self._state: bytes | None = None
+        self._incidents: list[str] = []
+        self._delivered: Mapping[int, int] | None = None
+        self._asked = self._tried = self._done = self._lost = 0
+        self._trouble = ""
+        self._slow = self._closing = False
+        self._changed = threading.Condition()
+        self._ballast = Ballast(beside(self.path, ".ballast"))
+        self._boot_file = BootFile(beside(self.path, ".boot"))
+        try:
+            self._file, self.boot = self._open(new_boot)
+        except BaseException:
+            self._lock.close()
+            raise
+        self._ballast.take()
+        self._thread = threading.Thread(target=self._write, name="journal", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def append(self, events: Sequence[Event], state: bytes) -> bool:
+        """Write events and the supervisor's state after them in one transaction.
+
+        True: all of it, and all that waited before, is on the disk. False: it waits in memory, and `fault` says why.
+        """
+        with self._changed:
+            self._queue.extend(events)
+            self._state = state
+            while len(self._queue) > self._queue_events:
+                self._queue.popleft()
+                self._lost += 1
+            self._asked += 1
+            ticket = self._asked
+            self._changed.notify_all()
+            patience_s = 0 if self._slow else self._patience_ns / 1e9
+            if not self._changed.wait_for(lambda: self._tried >= ticket, patience_s):
+                self._slow = True
+            return self._done >= ticket
+
+    @property
+    def fault(self) -> str | None:
+        """Why events wait in memory or may soon have to; None while the journal works. Worth an alarm."""
+        with self._changed:
+            trouble = self._trouble or ("the disk is slow" if self._slow else "")
+            if not trouble and not self._ballast.held:
+                trouble = "the disk is full but for the reserve for alarms, which is in use; delete files on that disk"
+            if not trouble:
+                return None
+            waiting = f"; {len(self._queue)} events wait in memory" if self._queue else ""
+            lost = f", {self._lost} are lost" if self._lost else ""
+            return f"journal {self.path}: {trouble}{waiting}{lost}"
+
+    @property
+    def incidents(self) -> tuple[str, ...]:
+        """What befell the file, oldest first: corrupt and set aside, gone, events dropped. Worth an alarm each."""
+        return tuple(self._incidents)
+
+    @property
+    def pending(self) -> tuple[Event, ...]:
+        """Events that wait in memory, oldest first: not on the disk, so the radio is all they have."""
+        with self._changed:
+            return tuple(self._queue)
+
+    @property
+    def lost(self) -> int:
+        """Events dropped from memory because too many waited."""
+        return self._lost
+
+    def restored_state(self) -> bytes | None:
+        """The state as last written before this opening, None in a new journal."""
+        return self._restored
+
+    def prune(self, delivered: Mapping[int, int]) -> None:
+        """Let the journal shrink to its bound, later, in its own thread: delivered events go first, oldest first.
+
+        delivered: boot -> seq up to which level 2 acknowledged everything. An undelivered event is dropped only when no
+        delivered one is left, and that is an incident.
+        """
+        with self._changed:
+            self._delivered = dict(delivered)
+            self._changed.notify_all()
+
+    def close(self, timeout_s: float = 10.0) -> None:
+        """Write what waits, if the disk lets it within the time, and close the file."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(timeout_s)
+        self._lock.close()
+
+    def _open(self, new_boot: int) -> tuple[JournalFile, int]:
+        try:
+            previous = self._boot_file.read()
+            existed = self.path.exists() and self.path.stat().st_size > 0
+            file = self._connect(previous + 1)
+            boot = max(previous, file.last_boot()) + 1
+            self._boot_file.write(boot)
+        except (sqlite3.Error, OSError) as error:
+            raise cannot_write(self.path, error) from None
+        if previous and not existed:
+            self._incidents.append(f"journal {self.path} was gone: the events of boots up to {previous} are not in it")
+        if boot == 1 < new_boot:
+            boot = new_boot
+            self._boot_file.write(boot)
+        self._restored = file.state()
+        self._begin_boot(file, boot)
+        return file, boot
+
+    def _connect(self, boot: int) -> JournalFile:
+        """The file; a corrupt one is set aside first, named after the boot. Raises sqlite3.Error, OSError."""
+        try:
+            return JournalFile(self.path, self.unit)
+        except sqlite3.DatabaseError as error:
+            if code(error) == sqlite3.SQLITE_FULL and self._ballast.release():
+                return JournalFile(self.path, self.unit)
+            if not is_corrupt(error):
+                raise
+        kept = set_aside(self.path, boot)
+        file = JournalFile(self.path, self.unit)
+        saved = file.salvage(kept)
+        self._incidents.append(f"journal {self.path} was corrupt: kept as {kept.name}, {saved} events saved from it")
+        return file
+
+    def _begin_boot(self, file: JournalFile, boot: int) -> None:
+        """Try that the file can be written. A full disk is no reason not to supervise, a read-only one is."""
+        try:
+            file.commit(boot, (), None)
+        except sqlite3.Error as error:
+            if code(error) != sqlite3.SQLITE_FULL:
+                file.close()
+                raise cannot_write(self.path, error) from None
+            self._trouble = str(error)
+
+    # The thread that writes
+
+    def _write(self) -> None:
+        while True:
+            with self._changed:
+                works = not self._trouble and not self._slow
+                called = self._changed.wait_for(self._has_work, None if works and self._ballast.held else RETRY_S)
+                if works and not called:
+                    self._take_ballast()
+                    continue
+                closing, ticket = self._closing, self._asked
+                batch, state = tuple(self._queue), self._state
+                delivered, self._delivered = self._delivered, None
+            start_ns = time.monotonic_ns()
+            trouble = self._attempt(batch, state)
+            slow = time.monotonic_ns() - start_ns > self._patience_ns
+            with self._changed:
+                self._settle(ticket, batch, trouble, slow)
+            if delivered is not None and not trouble:
+                self._drop(delivered)
+            if closing:
+                self._file.close()
+                return
+
+    def _take_ballast(self) -> None:
+        if not self._ballast.held and self._ballast.take():
+            with suppress(sqlite3.Error):
+                self._file.save_space(False)
+
+    def _has_work(self) -> bool:
+        return self._closing or self._asked > self._tried or self._delivered is not None
+
+    def _settle(self, ticket: int, batch: Sequence[Event], trouble: str, slow: bool) -> None:
+        self._trouble, self._slow, self._tried = trouble, slow, ticket
+        if not trouble:
+            self._done = ticket
+            last = (batch[-1].boot, batch[-1].seq) if batch else FIRST
+            while self._queue and (self._queue[0].boot, self._queue[0].seq) <= last:
+                self._queue.popleft()
+        self._changed.notify_all()
+
+    def _attempt(self, batch: Sequence[Event], state: bytes | None) -> str:
+        """Bring everything on the disk. Gives what stood in the way, "" for success."""
+        try:
+            self._commit(batch, state)
+            self._take_ballast()
+            return ""
+        except sqlite3.Error as error:
+            return f"can't be written ({error})"
+        except OSError as error:
+            return f"can't be written ({error.strerror or error})"
+        except Exception as error:  # a thread that ended would take the journal with it
+            return f"can't be written ({type(error).__name__}: {error})"
+
+    def _commit(self, batch: Sequence[Event], state: bytes | None) -> None:
+        """Write, with what helps against a file that vanished or is corrupt and against a full disk."""
+        if not self._file.in_place:
+            self._replace()
+        try:
+            self._file.commit(self.boot, batch, state)
+        except sqlite3.Error as error:
+            if is_corrupt(error):
+                self._file.close()
+                self._file = self._connect(self.boot)
+                self._file.commit(self.boot, batch, state)
+            elif code(error) == sqlite3.SQLITE_FULL:
+                self._commit_on_full_disk(batch, state)
+            else:
+                raise
+
+    def _commit_on_full_disk(self, batch: Sequence[Event], state: bytes | None) -> None:
+        self._file.reuse_log()
+        try:
+            self._file.commit(self.boot, batch, state)
+        except sqlite3.Error as error:
+            if code(error) != sqlite3.SQLITE_FULL or not self._ballast.release():
+                raise
+            self._file.save_space(True)
+            self._file.reuse_log()
+            self._file.commit(self.boot, batch, state)
+
+    def _replace(self) -> None:
+        gone = not self.path.exists()
+        self._file.close()
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._boot_file.write(self.boot)
+        self._file = self._connect(self.boot)
+        if gone:
+            self._incidents.append(f"journal {self.path} was taken away while in use: a new one is begun")
+
+    def _drop(self, delivered: Mapping[int, int]) -> None:
+        """Down to the bound: delivered events first, as the last resort the oldest of all."""
+        try:
+            for boot, seq in sorted(delivered.items()):
+                self._drop_while_too_big(boot, seq)
+            dropped = self._drop_while_too_big(self.boot, None)
+        except (sqlite3.Error, OSError):
+            return  # the next commit meets the same trouble and reports it
+        if dropped:
+            self._incidents.append(f"journal {self.path} is too big: {dropped} events dropped that level 2 never got")
+
+    def _drop_while_too_big(self, boot: int, seq: int | None) -> int:
+        dropped = 0
+        while self._file.size() > self._keep_bytes and (count := self._file.delete_oldest(boot, seq, DROP_EVENTS)):
+            dropped += count
+        return dropped
+
+
+def _locked(path: Path) -> IO[str]:
+    """The lock that only one writer holds; it goes with the process. Raises JournalError."""
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(0, "it is a folder")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = open(beside(path, ".lock"), "a+")
+    except OSError as error:
+        raise cannot_write(path, error) from None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.seek(0)
+        owner = file.read().strip()
+        file.close()
+        raise JournalError(f"journal {path}: in use by process {owner or 'unknown'}; "
+                           "stop that `ucs run`, or set another [journal] path") from None
+    file.truncate(0)
+    file.write(str(os.getpid()))
+    file.flush()
+    return file

@@ -1,0 +1,283 @@
+"""The journal's SQLite file: its tables, its versions, what to do when it is corrupt."""
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+
+from level1.event import Event, decode, encode
+from level1.io.bootfile import sync_folder
+from level1.io.error import OutsideError
+
+APPLICATION_ID = 0x5543_536A
+"""`UCSj`: SQLite's mark of whose file it is."""
+FIRST = (0, 0)
+"""The position before every event."""
+INSERT = "INSERT OR IGNORE INTO event VALUES (?, ?, ?, ?, ?)"
+"""OR IGNORE: a try that failed half-way may have got there; an identity is never used twice."""
+
+Position = tuple[int, int]
+"""(boot, seq): which event, in the order in which they happened."""
+
+
+class JournalError(OutsideError):
+    """The journal can't be opened or read. One line: what is wrong, what to do."""
+
+
+class CorruptError(sqlite3.DatabaseError):
+    """SQLite's own check found the file damaged."""
+
+
+def _create(connection: sqlite3.Connection) -> None:
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute("CREATE TABLE unit (name TEXT NOT NULL)")
+    connection.execute("CREATE TABLE boot (boot INTEGER PRIMARY KEY)")
+    connection.execute("CREATE TABLE state (one INTEGER PRIMARY KEY CHECK (one = 1), boot INTEGER, snapshot BLOB)")
+    connection.execute("CREATE TABLE event (boot INTEGER, seq INTEGER, alarm TEXT, event TEXT, line BLOB,"
+                       " PRIMARY KEY (boot, seq)) WITHOUT ROWID")
+
+
+MIGRATIONS: tuple[Callable[[sqlite3.Connection], None], ...] = (_create,)
+"""Step n makes a file of schema version n into one of version n + 1, all in the transaction that opens the file."""
+
+
+class JournalFile:
+    """An open journal file and the connection to it. Raises sqlite3.Error, OSError, JournalError."""
+
+    def __init__(self, path: Path, unit: str):
+        self.path = path
+        self.connection = sqlite3.connect(path, timeout=0.1, isolation_level=None, check_same_thread=False)
+        try:
+            self._prepare(unit)
+            self._identity = identity(path)
+        except BaseException:
+            self.connection.close()
+            raise
+
+    @property
+    def in_place(self) -> bool:
+        """Whether the file is still the one at its path: SQLite would write on into a deleted file without a word."""
+        return self._identity is not None and identity(self.path) == self._identity
+
+    def commit(self, boot: int, events: Iterable[Event], state: bytes | None) -> None:
+        """Write in one transaction; on the disk when it returns. Always writes something: success means it works."""
+        connection = self.connection
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            connection.executemany(INSERT, map(_row, events))
+            if state is None:
+                connection.execute("INSERT OR REPLACE INTO boot VALUES (?)", (boot,))
+            else:
+                connection.execute("INSERT OR REPLACE INTO state VALUES (1, ?, ?)", (boot, state))
+            connection.execute("COMMIT")
+        except BaseException:
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
+            raise
+
+    def reuse_log(self) -> None:
+        """Move the write-ahead log into the file, if the disk lets it, so that the log's space serves again."""
+        with suppress(sqlite3.OperationalError):
+            self.connection.execute("PRAGMA wal_checkpoint(RESTART)")
+
+    def save_space(self, on: bool) -> None:
+        """Keep the log short, for the sake of space, or let it grow to SQLite's default, for the sake of the card."""
+        self.connection.execute(f"PRAGMA wal_autocheckpoint = {16 if on else 1000}")
+
+    def last_boot(self) -> int:
+        """The highest boot id in it, 0 in a new one."""
+        return max(scalar(self.connection, f"SELECT max(boot) FROM {table}") for table in ("boot", "event", "state"))
+
+    def state(self) -> bytes | None:
+        """The supervisor's state as last written."""
+        row = self.connection.execute("SELECT snapshot FROM state").fetchone()
+        return row[0] if row else None
+
+    def size(self) -> int:
+        """Bytes in use; the file itself doesn't shrink, its free pages are used again."""
+        names = ("page_count", "freelist_count", "page_size")
+        pages, free, page_bytes = (scalar(self.connection, f"PRAGMA {name}") for name in names)
+        return (pages - free) * page_bytes
+
+    def delete_oldest(self, boot: int, seq: int | None, count: int) -> int:
+        """Delete the `count` oldest events of a boot up to a seq, or (seq None) of all boots up to it; how many."""
+        where, values = ("boot = ? AND seq <= ?", (boot, seq)) if seq is not None else ("boot <= ?", (boot,))
+        return self.connection.execute(
+            "DELETE FROM event WHERE (boot, seq) IN "
+            f"(SELECT boot, seq FROM event WHERE {where} ORDER BY boot, seq LIMIT {count})", values).rowcount
+
+    def salvage(self, kept: Path) -> int:
+        """Copy in what a corrupt file still gives, from both ends; the number of events saved."""
+        before = self.connection.total_changes
+        old = sqlite3.connect(kept, isolation_level=None)
+        try:
+            for order in ("boot, seq", "boot DESC, seq DESC"):
+                self.connection.execute("BEGIN IMMEDIATE")
+                self.connection.executemany(INSERT, _valid(_readable(old, f"SELECT line FROM event ORDER BY {order}")))
+                self.connection.execute("COMMIT")
+            saved = self.connection.total_changes - before
+            for boot, snapshot in _readable(old, "SELECT boot, snapshot FROM state"):
+                if isinstance(boot, int) and isinstance(snapshot, bytes):
+                    self.connection.execute("INSERT OR REPLACE INTO state VALUES (1, ?, ?)", (boot, snapshot))
+            return saved
+        finally:
+            old.close()
+
+    def close(self) -> None:
+        """Close the connection; its last act moves the write-ahead log into the file."""
+        self._identity = None
+        self.connection.close()
+
+    def _prepare(self, unit: str) -> None:
+        connection = self.connection
+        version = scalar(connection, "PRAGMA user_version")
+        if version > len(MIGRATIONS):
+            raise too_new(self.path, version)
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = FULL")
+        connection.execute("PRAGMA cell_size_check = ON")
+        verdict = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+        if verdict != "ok":
+            raise CorruptError(verdict)
+        if version < len(MIGRATIONS):
+            self._migrate(unit, version)
+        owner = connection.execute("SELECT name FROM unit").fetchone()
+        if owner is None:
+            raise CorruptError("names no unit")
+        if owner[0] != unit:
+            raise JournalError(f'journal {self.path}: belongs to the unit "{owner[0]}", not "{unit}"; '
+                               "give each unit a [journal] path of its own")
+
+    def _migrate(self, unit: str, version: int) -> None:
+        connection = self.connection
+        if version == 0 and scalar(connection, "SELECT count(*) FROM sqlite_master"):
+            raise JournalError(f"journal {self.path}: is another program's database; set another [journal] path")
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            for migration in MIGRATIONS[version:]:
+                migration(connection)
+            if version == 0:
+                connection.execute("INSERT INTO unit VALUES (?)", (unit,))
+            connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
+            connection.execute("COMMIT")
+        except BaseException:
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
+            raise
+        sync_folder(self.path.parent)
+
+
+def set_aside(path: Path, boot: int) -> Path:
+    """Rename a corrupt file, with its write-ahead log, after the boot that found it; gives its path. Raises OSError."""
+    number = 0
+    while (kept := beside(path, f".corrupt-{boot}" + f"-{number}" * bool(number))).exists():
+        number += 1
+    os.rename(path, kept)
+    if beside(path, "-wal").exists():
+        os.rename(beside(path, "-wal"), beside(kept, "-wal"))
+    beside(path, "-shm").unlink(missing_ok=True)
+    sync_folder(path.parent)
+    return kept
+
+
+def open_for_reading(path: Path) -> sqlite3.Connection:
+    """A connection that can't write. Raises JournalError, among them for a file that is no journal."""
+    if not path.is_file():
+        raise JournalError(f"journal {path}: no such file; give the path of one that `ucs run` wrote")
+    try:
+        connection = _read_only(path)
+        version, mark = scalar(connection, "PRAGMA user_version"), scalar(connection, "PRAGMA application_id")
+    except sqlite3.Error as error:
+        raise unreadable(path, error) from None
+    if mark == APPLICATION_ID and 0 < version <= len(MIGRATIONS):
+        return connection
+    connection.close()
+    if mark == APPLICATION_ID and version:
+        raise too_new(path, version)
+    raise JournalError(f"journal {path}: not a journal; give the path of one that `ucs run` wrote")
+
+
+def _read_only(path: Path) -> sqlite3.Connection:
+    uri = path.absolute().as_uri() + "?mode=ro"
+    connection = sqlite3.connect(uri, uri=True, timeout=1.0, isolation_level=None, check_same_thread=False)
+    try:
+        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        return connection
+    except sqlite3.OperationalError as error:
+        connection.close()
+        # a reader of a WAL file needs shared memory beside it; on a read-only disk nothing can change under it either
+        if code(error) not in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY) or os.access(path.parent, os.W_OK):
+            raise
+    return sqlite3.connect(uri + "&immutable=1", uri=True, isolation_level=None, check_same_thread=False)
+
+
+def beside(path: Path, suffix: str) -> Path:
+    """The file whose name is the journal's with a suffix."""
+    return path.with_name(path.name + suffix)
+
+
+def identity(path: Path) -> tuple[int, int] | None:
+    """Which file a path names, None when there is none."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+def scalar(connection: sqlite3.Connection, query: str, values: Sequence[int] = ()) -> int:
+    """The integer a query gives; NULL is 0."""
+    return int(connection.execute(query, values).fetchone()[0] or 0)
+
+
+def code(error: BaseException) -> int:
+    """SQLite's primary result code, 0 where the error has none."""
+    return int(getattr(error, "sqlite_errorcode", 0)) & 0xFF
+
+
+def is_corrupt(error: BaseException) -> bool:
+    """Whether the file's content is at fault, so that another file would do."""
+    return isinstance(error, CorruptError) or code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+
+def cannot_write(path: Path, error: Exception) -> JournalError:
+    """The error of a journal that can't be opened for writing."""
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return JournalError(f"journal {path}: can't be written ({reason}); "
+                        f"make {path.parent} a folder that this user may write to, or set another [journal] path")
+
+
+def unreadable(path: Path, error: Exception) -> JournalError:
+    """The error of a journal that can't be read."""
+    return JournalError(f"journal {path}: can't be read ({error}); `ucs run` sets a corrupt one aside and begins anew")
+
+
+def too_new(path: Path, version: int) -> JournalError:
+    """The error of a journal from a later version of this program."""
+    known = len(MIGRATIONS)
+    return JournalError(f"journal {path}: written by a later version (schema {version}, this one knows {known}); "
+                        "install that version, or set another [journal] path")
+
+
+def _row(event: Event) -> tuple[int, int, str, str, bytes]:
+    return event.boot, event.seq, event.alarm, event.event, encode(event)
+
+
+def _readable(connection: sqlite3.Connection, query: str) -> Iterator[tuple[object, ...]]:
+    """Rows up to the first that can't be read."""
+    try:
+        yield from connection.execute(query)
+    except sqlite3.Error:
+        return
+
+
+def _valid(rows: Iterator[tuple[object, ...]]) -> Iterator[tuple[int, int, str, str, bytes]]:
+    for line, in rows:
+        try:
+            yield _row(decode(line if isinstance(line, bytes) else b""))
+        except msgspec.DecodeError:
+            continue
