@@ -1,0 +1,203 @@
+"""The text of a DBC file as an index of its statements: where each one stands, and its numbers exactly as written.
+
+The parser proper is cantools; it keeps neither lines nor decimals, raises at the first mistake, and trusts what it reads.
+This index gives every problem its line, finds what cantools would stumble over, and measures a file before cantools sees it.
+A pure function of the text; its one pass takes time in proportion to the text's length, whatever it holds.
+"""
+from __future__ import annotations
+
+import re
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from decimal import Decimal
+
+EXTENDED_ID = 0x8000_0000
+"""Bit of a 29-bit identifier as a DBC file writes it."""
+UNUSED_MESSAGE = "VECTOR__INDEPENDENT_SIG_MSG"
+"""Vector's name for the message that holds signals of no message; cantools leaves it out too."""
+
+_STRING = r'"[^"\\]*+(?:\\"?[^"\\]*+)*+"'
+_NUMBER = r"[-+]?\d{1,400}\.?\d{0,400}(?:[eE][-+]?\d{1,4})?(?![\w.])"
+_INT = r"\d{1,12}"
+_OBJECT = r"(?:(?P<kind>SG_|BO_|BU_|EV_)\s+(?P<object>\w+)(?:\s+(?P<signal>[A-Za-z_]\w*))?\s*)?"
+
+_HEAD = re.compile(
+    rf"{_STRING}|\b(?P<word>BO_|SG_|BA_|BA_DEF_|BA_DEF_DEF_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_)(?=\s)", re.DOTALL)
+_BODIES: Mapping[str, re.Pattern[str]] = {
+    "BO_": re.compile(rf"BO_\s+(?P<id>{_INT})\s+(?P<name>\w+)\s*:\s*(?P<length>{_INT})\s+(?P<sender>\w+)"),
+    "SG_": re.compile(
+        rf"SG_\s+(?P<name>\w+)(?:\s+(?P<mux>\w+))?\s*:\s*(?P<start>{_INT})\s*\|\s*(?P<length>{_INT})\s*@\s*(?P<order>[01])"
+        rf"\s*(?P<sign>[-+])\s*\(\s*(?P<factor>{_NUMBER})\s*,\s*(?P<offset>{_NUMBER})\s*\)"
+        rf"\s*\[\s*(?P<minimum>{_NUMBER})\s*\|\s*(?P<maximum>{_NUMBER})\s*\]"),
+    "BA_": re.compile(rf'BA_\s+"(?P<name>[^"]*)"\s*{_OBJECT}(?P<value>{_STRING}|{_NUMBER})\s*;', re.DOTALL),
+    "BA_DEF_": re.compile(
+        r'BA_DEF_\s+(?:(?P<kind>SG_|BO_|BU_|EV_)\s+)?"(?P<name>[^"]*)"\s*(?P<type>\w+)(?P<rest>[^;]*);'),
+    "BA_DEF_DEF_": re.compile(rf'BA_DEF_DEF_\s+"(?P<name>[^"]*)"\s*(?P<value>{_STRING}|{_NUMBER})\s*;', re.DOTALL),
+    "VAL_": re.compile(rf"VAL_\s+(?P<id>{_INT})\s+(?P<name>\w+)(?P<rest>(?:\s*{_NUMBER}\s*{_STRING})*+)\s*;", re.DOTALL),
+    "SIG_VALTYPE_": re.compile(rf"SIG_VALTYPE_\s+(?P<id>{_INT})\s+(?P<name>\w+)\s*:\s*(?P<type>{_INT})\s*;"),
+    "SG_MUL_VAL_": re.compile(
+        rf"SG_MUL_VAL_\s+(?P<id>{_INT})\s+(?P<name>\w+)\s+(?P<multiplexer>\w+)\s+(?P<ranges>{_INT}\s*-\s*{_INT}(?:\s*,\s*{_INT}\s*-\s*{_INT})*+)\s*;"),
+}
+_MALFORMED: Mapping[str, re.Pattern[str]] = {
+    "BO_": re.compile(r'BO_\s[^:;"]*:'),
+    "SG_": re.compile(r'SG_\s[^:;"]*:'),
+    "SG_MUL_VAL_": re.compile(r'SG_MUL_VAL_\s+\d[^;]*;?'),
+}
+"""What is meant as such a statement although it can't be read: cantools must not see what the index has not measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class SignalText:
+    """A `SG_` line: numbers as written. multiplexer: `M`, `m3`, `m3M` or ""."""
+
+    line: int
+    span: tuple[int, int]
+    name: str
+    multiplexer: str
+    start: str
+    length: str
+    factor: str
+    offset: str
+    minimum: str
+    maximum: str
+
+
+@dataclass(frozen=True, slots=True)
+class MessageText:
+    """A `BO_` line and its signals. id: as written, 29-bit identifiers with `EXTENDED_ID`. length: bytes."""
+
+    line: int
+    span: tuple[int, int]
+    id: int
+    name: str
+    length: int
+    signals: list[SignalText] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class AttributeText:
+    """A `BA_` line. kind: `SG_`, `BO_`, `BU_`, `EV_` or "" (the network). object: id or node name; value: as written."""
+
+    line: int
+    span: tuple[int, int]
+    name: str
+    kind: str
+    object: str
+    signal: str
+    value: str
+
+
+@dataclass(frozen=True, slots=True)
+class DefinitionText:
+    """A `BA_DEF_` line."""
+
+    line: int
+    name: str
+    kind: str
+    type: str
+
+
+@dataclass(frozen=True, slots=True)
+class EntryText:
+    """A `VAL_`, `SIG_VALTYPE_` or `SG_MUL_VAL_` statement; text: the statement."""
+
+    line: int
+    span: tuple[int, int]
+    word: str
+    id: int
+    name: str
+    text: str
+    ranges: tuple[tuple[int, int], ...] = ()
+    multiplexer: str = ""
+
+
+class DbcText:
+    """The statements of a text, in its order."""
+
+    def __init__(self, text: str):
+        self.text = text = _without_comments(text)
+        self.messages: list[MessageText] = []
+        self.attributes: list[AttributeText] = []
+        self.definitions: dict[str, DefinitionText] = {}
+        self.entries: list[EntryText] = []
+        self.malformed: list[tuple[int, str]] = []
+        self._newlines = [match.start() for match in re.finditer("\n", text)]
+        for word, match in _statements(text):
+            if match.re is _MALFORMED.get(word):
+                self.malformed.append((self.line_at(match.start()), match.group()[:60]))
+            else:
+                self._add(word, match)
+        self._attribute_lines = {(a.kind, a.object, a.signal, a.name): a.line for a in self.attributes}
+
+    def line_at(self, offset: int) -> int:
+        """1-based line of an offset."""
+        return bisect_right(self._newlines, offset - 1) + 1
+
+    def attribute_line(self, name: str, message_id: int, signal: str = "") -> int:
+        """Line of a message's or signal's attribute, 0 when it is not set there."""
+        kind = "SG_" if signal else "BO_"
+        return self._attribute_lines.get((kind, str(message_id), signal, name), 0)
+
+    def without(self, spans: Iterable[tuple[int, int]]) -> str:
+        """The text with some statements blanked out, every line where it was."""
+        parts: list[str] = []
+        position = 0
+        for start, end in sorted(set(spans)):
+            parts.append(self.text[position:start])
+            parts.append(re.sub(r"[^\n]", " ", self.text[start:end]))
+            position = end
+        return "".join([*parts, self.text[position:]])
+
+    def _add(self, word: str, match: re.Match[str]) -> None:
+        line, span = self.line_at(match.start()), match.span()
+        group = match.group
+        if word == "BO_":
+            self.messages.append(MessageText(line, span, int(group("id")), group("name"), int(group("length"))))
+        elif word == "SG_":
+            if self.messages:
+                self.messages[-1].signals.append(SignalText(
+                    line, span, group("name"), group("mux") or "", group("start"), group("length"), group("factor"),
+                    group("offset"), group("minimum"), group("maximum")))
+        elif word == "BA_":
+            self.attributes.append(AttributeText(
+                line, span, group("name"), group("kind") or "", group("object") or "", group("signal") or "", group("value")))
+        elif word == "BA_DEF_":
+            self.definitions[group("name")] = DefinitionText(line, group("name"), group("kind") or "", group("type"))
+        elif word == "SG_MUL_VAL_":
+            self.entries.append(EntryText(line, span, word, int(group("id")), group("name"), group(), _ranges(group("ranges")),
+                                          group("multiplexer")))
+        elif word in ("VAL_", "SIG_VALTYPE_"):
+            self.entries.append(EntryText(line, span, word, int(group("id")), group("name"), group()))
+
+
+def decimal(number: str) -> Decimal:
+    """A number of a DBC file, exactly."""
+    return Decimal(number)
+
+
+def _ranges(text: str) -> tuple[tuple[int, int], ...]:
+    return tuple((int(low), int(high)) for low, high in re.findall(r"(\d+)\s*-\s*(\d+)", text))
+
+
+def _without_comments(text: str) -> str:
+    if "//" not in text:
+        return text
+    return re.sub(rf"{_STRING}|//[^\n]*", lambda m: m[0] if m[0][0] == '"' else " " * len(m[0]), text, flags=re.DOTALL)
+
+
+def _statements(text: str) -> Iterator[tuple[str, re.Match[str]]]:
+    position = 0
+    while head := _HEAD.search(text, position):
+        position = head.end()
+        word = head["word"]
+        if word is None:
+            continue
+        match = _BODIES[word].match(text, head.start())
+        if match is None and word in _MALFORMED:
+            match = _MALFORMED[word].match(text, head.start())
+            if match and all(part.endswith(("_", ":")) for part in match.group().split()):
+                continue  # the list of keywords behind NS_
+        if match:
+            position = match.end()
+            yield word, match

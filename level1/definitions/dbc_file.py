@@ -1,0 +1,328 @@
+"""One DBC file, read: its messages as `level1.catalog` has them, its attributes with their lines, and what is wrong with it.
+
+cantools parses; this module gives its result exact numbers and lines (from `level1.dbc_text`) and turns every refusal into
+a `Problem`. Pure: text in, values out.
+"""
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import TYPE_CHECKING, Any
+
+import cantools.database.can
+from cantools.database.errors import Error as CantoolsError
+from textparser import ParseError
+
+from level1 import dbc_text, similar
+from level1.catalog import Message, Problem, Signal
+from level1.dbc_text import EXTENDED_ID, UNUSED_MESSAGE, DbcText, EntryText, MessageText, SignalText
+from level1.frame import j1939_pgn
+from level1.scaling import FLOAT_LENGTHS, float_bits, raw_range
+
+if TYPE_CHECKING:
+    from cantools.database.can.message import Message as DbcMessage
+    from cantools.database.can.signal import Signal as DbcSignal
+
+ANY_SOURCE = 0xFE
+"""Source address in a J1939 identifier that stands for any (J1939-81: the null address; DESIGN §3)."""
+Owner = tuple[str, str]
+"""Message name and signal name ("" for the message itself): whose attribute it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attribute:
+    """A value of an attribute (enumerations as their word), its line (0: the default of the file), and whether it is set
+    on the object itself and differs from the file's default."""
+
+    value: str | int | float
+    line: int
+    explicit: bool
+
+
+@dataclass(frozen=True, slots=True)
+class DbcFile:
+    """What a file holds. attributes: of messages and signals, with the defaults of the file."""
+
+    path: str
+    text: DbcText
+    messages: tuple[Message, ...]
+    attributes: Mapping[Owner, Mapping[str, Attribute]]
+    problems: tuple[Problem, ...]
+    lines: Mapping[Owner, int]
+
+
+def read(path: str, text: str) -> DbcFile:
+    """The content of a file. Its problems tell what could not be read; what could be is there all the same."""
+    reader = _Reader(path, DbcText(text))
+    return reader.read()
+
+
+class _Reader:
+    """Reads one file; collects its problems on the way."""
+
+    def __init__(self, path: str, text: DbcText):
+        self._path = path
+        self._text = text
+        self._problems: list[Problem] = []
+        self._blanked: list[tuple[int, int]] = []
+
+    def read(self) -> DbcFile:
+        self._find_malformed()
+        self._find_duplicates()
+        self._find_undefined_attributes()
+        self._find_stray_entries()
+        database = None if self._text.malformed else self._parse()
+        pairs = list(self._pairs(database)) if database else []
+        messages = tuple(self._message(parsed, text) for parsed, text in pairs)
+        attributes = {owner: values for pair in pairs for owner, values in self._attributes(*pair)}
+        lines = {owner: line for pair in pairs for owner, line in _lines(*pair)}
+        return DbcFile(self._path, self._text, messages, attributes, tuple(self._problems), lines)
+
+    def _problem(self, line: int, message: str, hint: str = "", *, where: str = "", attribute: str = "",
+                 severity: str = "error") -> None:
+        self._problems.append(Problem(self._path, line, where, attribute, 0, severity, message, hint))
+
+    # -- before cantools: what it would stumble over ------------------------------------------------------------------
+
+    def _find_malformed(self) -> None:
+        for line, text in self._text.malformed:
+            short = " ".join(text.split())
+            self._problem(line, f"`{short} …` can't be read", "numbers, brackets or order of the statement are wrong")
+
+    def _find_duplicates(self) -> None:
+        ids: dict[int, MessageText] = {}
+        names: dict[str, MessageText] = {}
+        for message in self._text.messages:
+            if message.name == UNUSED_MESSAGE:
+                continue
+            if first := ids.get(message.id):
+                self._duplicate(message, f"identifier {_id_text(message.id)} is used twice, first by {first.name} in line "
+                                f"{first.line}")
+            elif first := names.get(message.name):
+                self._duplicate(message, f"message name is used twice, first in line {first.line}")
+            ids.setdefault(message.id, message)
+            names.setdefault(message.name, message)
+            self._find_duplicate_signals(message)
+
+    def _duplicate(self, message: MessageText, text: str) -> None:
+        self._problem(message.line, text, where=message.name)
+        end = max([message.span[1], *(signal.span[1] for signal in message.signals)])
+        self._blanked.append((message.span[0], self._statement_end(end)))
+
+    def _find_duplicate_signals(self, message: MessageText) -> None:
+        lines: dict[str, int] = {}
+        for signal in message.signals:
+            if signal.name in lines:
+                self._problem(signal.line, f"signal name is used twice in its message, first in line {lines[signal.name]}",
+                              where=f"{message.name}.{signal.name}")
+            lines.setdefault(signal.name, signal.line)
+
+    def _find_undefined_attributes(self) -> None:
+        unknown = [a for a in self._text.attributes if a.name not in self._text.definitions]
+        for attribute in unknown:
+            self._blanked.append(attribute.span)
+            kind = f"{attribute.kind} " if attribute.kind else ""
+            self._problem(attribute.line, f'attribute "{attribute.name}" is not defined in this file',
+                          similar.hint(attribute.name, self._text.definitions)
+                          or f'add a line like `BA_DEF_ {kind}"{attribute.name}" STRING ;`')
+
+    def _find_stray_entries(self) -> None:
+        signals = {m.id: {s.name: s for s in m.signals} for m in self._text.messages}
+        seen: set[tuple[str, int, str]] = set()
+        for entry in self._text.entries:
+            key = (entry.word, entry.id, entry.name)
+            if entry.name not in signals.get(entry.id, ()):
+                self._stray(entry, f"{entry.word} for {entry.name} of message {_id_text(entry.id)}, which is not there: ignored")
+            elif key in seen and entry.word != "SG_MUL_VAL_":
+                self._stray(entry, f"{entry.word} is given twice for {entry.name}: the first one is taken")
+            seen.add(key)
+
+    def _stray(self, entry: EntryText, message: str) -> None:
+        self._blanked.append(entry.span)
+        self._problem(entry.line, message, severity="warning")
+
+    def _statement_end(self, position: int) -> int:
+        end = self._text.text.find("\n", position)
+        return len(self._text.text) if end < 0 else end
+
+    # -- cantools -----------------------------------------------------------------------------------------------------
+
+    def _parse(self) -> cantools.database.can.Database | None:
+        database = cantools.database.can.Database(strict=False, sort_signals=None)
+        try:
+            database.add_dbc_string(self._text.without(self._blanked))
+        except ParseError as error:
+            self._problem(*self._syntax_error(error))
+        except CantoolsError as error:
+            self._problem(self._line_of_message(str(error)), str(error).rstrip("."))
+        except (ValueError, TypeError, KeyError, IndexError, AssertionError, AttributeError, ArithmeticError,
+                NotImplementedError, RecursionError) as error:
+            # cantools trusts its input; whatever it trips over is a mistake in the file
+            self._problem(0, f"the DBC reader can't make sense of it ({type(error).__name__}: {str(error)[:200]})",
+                          "open it in a DBC editor and save it again")
+        else:
+            return database
+        return None
+
+    def _syntax_error(self, error: ParseError) -> tuple[int, str, str]:
+        lines = self._text.text.split("\n")
+        line = int(error.line)
+        column = int(error.column)
+        found = re.match(r"\w+|.?", lines[line - 1][column - 1:column + 40] if line <= len(lines) else "")
+        token = found.group() if found else ""
+        what = f"`{token}` in column {column}" if token else f"column {column}"
+        return line, f"not a valid DBC file: {what} is not expected here", "the statement may have begun on a line before"
+
+    def _line_of_message(self, text: str) -> int:
+        return next((m.line for m in self._text.messages if text.endswith(f"in message {m.name}.")), 0)
+
+    def _pairs(self, database: cantools.database.can.Database) -> Iterator[tuple[DbcMessage, MessageText]]:
+        texts: dict[int, MessageText] = {}
+        for message in self._text.messages:
+            texts.setdefault(message.id, message)
+        for parsed in database.messages:
+            identifier = parsed.frame_id | (EXTENDED_ID if parsed.is_extended_frame else 0)
+            text = texts.get(identifier)
+            if text and len(text.signals) == len(parsed.signals):
+                yield parsed, text
+            else:
+                self._problem(text.line if text else 0, "its signals can't be told apart", "write one statement a line",
+                              where=parsed.name)
+
+    # -- after cantools -----------------------------------------------------------------------------------------------
+
+    def _message(self, parsed: DbcMessage, text: MessageText) -> Message:
+        j1939 = parsed.protocol == "j1939" and parsed.is_extended_frame
+        if parsed.protocol == "j1939" and not parsed.is_extended_frame:
+            self._problem(text.line, "VFrameFormat says J1939, but the identifier has 11 bits: matched by identifier",
+                          where=parsed.name, attribute="VFrameFormat", severity="warning")
+        source = parsed.frame_id & 0xFF
+        signals = tuple(self._signal(parsed, *pair) for pair in zip(parsed.signals, text.signals, strict=True))
+        self._find_overlaps(parsed, text, signals)
+        return Message(
+            name=parsed.name, can_id=parsed.frame_id, extended=parsed.is_extended_frame, length=parsed.length, signals=signals,
+            senders=tuple(parsed.senders), cycle_ns=_cycle_ns(parsed.cycle_time), j1939=j1939,
+            pgn=j1939_pgn(parsed.frame_id) if j1939 else None, source=source if j1939 and source != ANY_SOURCE else None,
+            is_fd=parsed.is_fd, comment=parsed.comment or "", file=self._path, line=text.line)
+
+    def _signal(self, message: DbcMessage, parsed: DbcSignal, text: SignalText) -> Signal:
+        where = f"{message.name}.{parsed.name}"
+        factor, offset = dbc_text.decimal(text.factor), dbc_text.decimal(text.offset)
+        is_float = bool(parsed.conversion.is_float)
+        minimum, maximum = self._limits(where, text)
+        if not factor:
+            self._problem(text.line, "factor 0: every raw value would mean the same", "write the resolution of one bit",
+                          where=where)
+        if parsed.length < 1:
+            self._problem(text.line, "a signal needs at least one bit", where=where)
+        elif is_float and parsed.length not in FLOAT_LENGTHS:
+            self._problem(text.line, f"a floating point signal can't have {parsed.length} bits", "16, 32 or 64", where=where)
+        elif not _fits(parsed, message.length):
+            self._problem(text.line, f"doesn't fit into its message of {message.length} bytes", where=where)
+        return Signal(
+            name=parsed.name, start=parsed.start, length=parsed.length, big_endian=parsed.byte_order == "big_endian",
+            signed=parsed.is_signed, is_float=is_float, factor=factor, offset=offset, minimum=minimum, maximum=maximum,
+            unit=parsed.unit or "", choices={int(raw): str(name) for raw, name in (parsed.choices or {}).items()},
+            initial_raw=self._initial_raw(where, parsed, is_float, text), is_multiplexer=bool(parsed.is_multiplexer),
+            multiplexer_signal=parsed.multiplexer_signal,
+            multiplexer_ids=None if parsed.multiplexer_ids is None else tuple(sorted(parsed.multiplexer_ids)),
+            comment=parsed.comment or "")
+
+    def _limits(self, where: str, text: SignalText) -> tuple[Decimal | None, Decimal | None]:
+        minimum, maximum = dbc_text.decimal(text.minimum), dbc_text.decimal(text.maximum)
+        if not minimum and not maximum:
+            return None, None
+        if minimum > maximum:
+            self._problem(text.line, f"its limits [{text.minimum}|{text.maximum}] are the wrong way round: ignored", where=where,
+                          severity="warning")
+            return None, None
+        return minimum, maximum
+
+    def _initial_raw(self, where: str, parsed: DbcSignal, is_float: bool, text: SignalText) -> int:
+        initial = parsed.raw_initial
+        if initial is None or parsed.length < 1:
+            return 0
+        if is_float and parsed.length in FLOAT_LENGTHS:
+            return float_bits(float(initial), parsed.length)
+        low, high = raw_range(parsed.length, parsed.is_signed)
+        if int(initial) != initial or not low <= initial <= high:
+            self._problem(text.line, f"start value {initial} is no raw value of {parsed.length} bits: 0 is taken", where=where,
+                          attribute="GenSigStartValue", severity="warning")
+            return 0
+        return int(initial)
+
+    def _find_overlaps(self, message: DbcMessage, text: MessageText, signals: tuple[Signal, ...]) -> None:
+        """Overlapping signals are no error: real files do that on purpose for variants of a message."""
+        plain = [(signal, line.line) for signal, line in zip(signals, text.signals, strict=True)
+                 if signal.multiplexer_ids is None and 0 < signal.length <= 8 * message.length]
+        owners: dict[int, str] = {}
+        for signal, line in plain:
+            taken = next((owners[bit] for bit in _bits(signal) if bit in owners), None)
+            if taken:
+                self._problem(line, f"overlaps {taken}", where=f"{message.name}.{signal.name}", severity="warning")
+            else:
+                owners.update(dict.fromkeys(_bits(signal), signal.name))
+
+    def _attributes(self, parsed: DbcMessage, text: MessageText) -> Iterator[tuple[Owner, Mapping[str, Attribute]]]:
+        yield (parsed.name, ""), self._values(parsed, "BO_", text.id, "")
+        for signal, line in zip(parsed.signals, text.signals, strict=True):
+            yield (parsed.name, signal.name), self._values(signal, "SG_", text.id, line.name)
+
+    def _values(self, item: Any, kind: str, identifier: int, signal: str) -> dict[str, Attribute]:
+        values: dict[str, Attribute] = {}
+        own = item.dbc.attributes or {}
+        for name, definition in item.dbc.attribute_definitions.items():
+            if definition.kind != kind:
+                continue
+            default = definition.default_value
+            if name in own:
+                line = self._text.attribute_line(name, identifier, signal)
+                value = self._word(definition, own[name].value, line)
+                values[name] = Attribute(value, line, value != default and value != "")
+            elif default is not None:
+                values[name] = Attribute(default, 0, False)
+        return values
+
+    def _word(self, definition: Any, value: Any, line: int) -> str | int | float:
+        if definition.type_name != "ENUM":
+            return value if isinstance(value, str | int | float) else str(value)
+        if 0 <= int(value) < len(definition.choices):
+            return str(definition.choices[int(value)])
+        self._problem(line, f"{value} is no value of the enumeration", f"0 to {len(definition.choices) - 1}",
+                      attribute=definition.name)
+        return ""
+
+
+def _lines(parsed: DbcMessage, text: MessageText) -> Iterator[tuple[Owner, int]]:
+    yield (parsed.name, ""), text.line
+    for signal, line in zip(parsed.signals, text.signals, strict=True):
+        yield (parsed.name, signal.name), line.line
+
+
+def _cycle_ns(cycle_ms: Any) -> int | None:
+    return round(float(cycle_ms) * 1_000_000) if cycle_ms and float(cycle_ms) > 0 else None
+
+
+def _id_text(identifier: int) -> str:
+    return f"0x{identifier & 0x1FFF_FFFF:X}" + (" (29 bit)" if identifier & EXTENDED_ID else "")
+
+
+def _first_bit(signal: Any) -> int:
+    """Offset of a big-endian signal's highest bit, counted from the highest bit of byte 0."""
+    return 8 * (int(signal.start) // 8) + 7 - int(signal.start) % 8
+
+
+def _fits(signal: DbcSignal, length: int) -> bool:
+    first = _first_bit(signal) if signal.byte_order == "big_endian" else signal.start
+    return 0 <= first and first + signal.length <= 8 * length
+
+
+def _bits(signal: Signal) -> Iterator[int]:
+    """Bits of the payload a signal takes, as 8 * byte + bit."""
+    if not signal.big_endian:
+        yield from range(signal.start, signal.start + signal.length)
+        return
+    first = _first_bit(signal)
+    yield from (8 * (bit // 8) + 7 - bit % 8 for bit in range(first, first + signal.length))

@@ -1,0 +1,173 @@
+"""DBC files from disk to a `Catalog`, in a child process with bounded memory and time.
+
+A DBC file comes from outside and its parser trusts it, so the child does the work and this process only takes the result:
+whatever a file holds, the supervisor neither hangs nor grows, and it never loads the parsers. The child is this module run
+as a program: request on its standard input, answer on its standard output (both msgpack), on standard error the file at hand.
+"""
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+
+import dbc
+from level1.catalog import Catalog, DefinitionError, Problem
+
+MEMORY_LIMIT = 900_000_000
+"""Bytes of address space of the child: an honest file of 100,000 lines takes half of it."""
+CPU_BASE_S, CPU_BYTES_PER_S = 8, 100_000
+"""Seconds of computing time of the child: a base, and one more for so many bytes. An honest file takes a fifth of that."""
+WALL_FACTOR = 6
+"""The child may take so many times longer on a busy machine before it is given up."""
+MAX_FILE_BYTES = 32_000_000
+"""Size of a file above which it isn't even read; 100,000 lines take 8 MB."""
+
+_OUT_OF_MEMORY = 3
+
+
+class _Request(msgspec.Struct, frozen=True):
+    """Files as (name in messages, path), and the buses of those that are bound."""
+
+    files: tuple[tuple[str, str], ...]
+    bindings: dict[str, tuple[int, ...]] = {}
+
+
+class _Answer(msgspec.Struct, frozen=True):
+    """What the child found."""
+
+    catalog: Catalog | None
+    problems: tuple[Problem, ...]
+
+
+def load(files: Sequence[str | Path], bus_files: Mapping[int, Sequence[str | Path]] | None = None) -> Catalog:
+    """The catalog of some DBC files. Raises DefinitionError with all errors and warnings when there is any error.
+
+    files: paths; a bare name that is no file in the current folder means a shipped one. bus_files: bus index -> the files
+    bound to it, loaded as well when `files` doesn't name them; messages of the other files are bound to no bus in particular.
+    """
+    catalog, problems = examine(files, bus_files)
+    if catalog is None:
+        raise DefinitionError(problems)
+    return catalog
+
+
+def examine(files: Sequence[str | Path],
+            bus_files: Mapping[int, Sequence[str | Path]] | None = None) -> tuple[Catalog | None, tuple[Problem, ...]]:
+    """The catalog, None when there is any error; and every error and warning. Arguments as of `load`."""
+    found: dict[str, str] = {}
+    problems: list[Problem] = []
+    for file in [*files, *(file for bound in (bus_files or {}).values() for file in bound)]:
+        try:
+            path = _find(file)
+        except OSError as error:
+            problems.append(Problem(str(file), 0, "", "", 0, "error", _reason(error), _shipped_hint(file)))
+        else:
+            found.setdefault(os.path.realpath(path), path)
+    if not found:
+        missing = Problem("ucs", 0, "", "", 0, "error", "no DBC file is given", "name at least one")
+        return None, tuple(problems) or (missing,)
+    answer = _ask(_Request(tuple((path, path) for path in found.values()), _bindings(found, bus_files or {})))
+    return None if problems else answer.catalog, (*problems, *answer.problems)
+
+
+def _find(file: str | Path) -> str:
+    """The path of a file, or of the shipped one of that name. Raises OSError."""
+    path = Path(file)
+    if not path.exists() and path.name == str(file):
+        try:
+            return str(dbc.path(path.name))
+        except FileNotFoundError:
+            pass
+    with path.open("rb"):
+        return str(path)
+
+
+def _reason(error: OSError) -> str:
+    return {FileNotFoundError: "no such file", IsADirectoryError: "is a folder, not a DBC file",
+            PermissionError: "may not be read"}.get(type(error), f"can't be read: {error.strerror}")
+
+
+def _shipped_hint(file: str | Path) -> str:
+    return f"shipped are {', '.join(dbc.shipped())}" if Path(file).name == str(file) else "check the path"
+
+
+def _bindings(found: Mapping[str, str], bus_files: Mapping[int, Sequence[str | Path]]) -> dict[str, tuple[int, ...]]:
+    buses: dict[str, set[int]] = {}
+    for bus, files in bus_files.items():
+        for file in files:
+            try:
+                label = found.get(os.path.realpath(_find(file)))
+            except OSError:
+                continue
+            if label:
+                buses.setdefault(label, set()).add(bus)
+    return {label: tuple(sorted(indexes)) for label, indexes in buses.items()}
+
+
+# -- the child ----------------------------------------------------------------------------------------------------------
+
+
+def _ask(request: _Request) -> _Answer:
+    """Lets a child do the work."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+    limit_s = _cpu_limit_s(path for _, path in request.files)
+    try:
+        child = subprocess.run([sys.executable, "-m", "level1.io.definitions"], input=msgspec.msgpack.encode(request),
+                               capture_output=True, env=environment, timeout=WALL_FACTOR * limit_s, check=False)
+    except subprocess.TimeoutExpired as error:
+        return _failed(error.stderr or b"", f"takes more than {error.timeout:.0f} s to read")
+    if child.returncode == 0:
+        return msgspec.msgpack.decode(child.stdout, type=_Answer)
+    reasons = {_OUT_OF_MEMORY: f"takes more than {MEMORY_LIMIT // 1_000_000} MB of memory to read",
+               -24: f"takes more than {limit_s} s of computing time to read",
+               -9: f"takes more than {limit_s} s of computing time to read"}
+    return _failed(child.stderr, reasons.get(child.returncode, f"broke the DBC reader (exit code {child.returncode})"))
+
+
+def _failed(progress: bytes, reason: str) -> _Answer:
+    """The answer for a child that didn't come back; `progress`: what it wrote, the file at hand in the last such line."""
+    lines = [line for line in progress.decode("utf-8", "replace").splitlines() if line.startswith("reading ")]
+    file = lines[-1].removeprefix("reading ") if lines else "ucs"
+    return _Answer(None, (Problem(file, 0, "", "", 0, "error", reason, "it is hostile or broken: don't use it"),))
+
+
+def _cpu_limit_s(paths: Iterable[str]) -> int:
+    return CPU_BASE_S + sum(min(os.path.getsize(path), MAX_FILE_BYTES) for path in paths) // CPU_BYTES_PER_S
+
+
+def _work(request: _Request) -> _Answer:
+    from level1 import definitions
+    files = []
+    problems: list[Problem] = []
+    for label, path in request.files:
+        print(f"reading {label}", file=sys.stderr, flush=True)
+        size = os.path.getsize(path)
+        if size > MAX_FILE_BYTES:
+            problems.append(Problem(label, 0, "", "", 0, "error", f"has {size} bytes: too large for a DBC file",
+                                    f"at most {MAX_FILE_BYTES} are read"))
+            continue
+        files.append(definitions.read(definitions.Source(label, definitions.decode(Path(path).read_bytes()))))
+    catalog, found = definitions.assemble(files, request.bindings)
+    return _Answer(None if problems else catalog, (*problems, *found))
+
+
+def _main() -> int:
+    """The child: limits itself, then works."""
+    request = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=_Request)
+    limit_s = _cpu_limit_s(path for _, path in request.files)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT, MEMORY_LIMIT))
+    resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s + 1))
+    try:
+        sys.stdout.buffer.write(msgspec.msgpack.encode(_work(request)))
+    except MemoryError:
+        return _OUT_OF_MEMORY
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(_main())
