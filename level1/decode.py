@@ -219,7 +219,8 @@ def compile_handler(message: Message, signals: list[tuple[Signal, Any]], touch: 
     short(t_ns, data) is called instead when the payload is too short for one of them. after(t_ns, data) comes last.
     """
     lines = ["def handle(t, d):"]
-    names: dict[str, Any] = {"touch": touch, "short": short, "after": after, "from_bytes": int.from_bytes, "unpack": struct.unpack_from}
+    names: dict[str, Any] = {"touch": touch, "short": short, "after": after, "from_bytes": int.from_bytes,
+                             "unpack": struct.unpack_from}
     need = max((last_byte(signal) + 1 for signal, _ in signals), default=0)
     if need:
         lines += [f" if len(d) < {need}:", "  short(t, d)", "  return"]
