@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import msgspec
 
@@ -79,6 +80,15 @@ ATTRIBUTES: Mapping[str, AttributeSpec] = {
 """Every attribute of the alarm language (DESIGN §3), besides Vector's own."""
 
 
+class Assembly(NamedTuple):
+    """What files give together. messages, alarms: how many there are, those with errors included."""
+
+    catalog: Catalog | None
+    problems: tuple[Problem, ...]
+    messages: int
+    alarms: int
+
+
 def build(sources: Sequence[Source],
           bindings: Mapping[str, Sequence[int]] | None = None) -> tuple[Catalog | None, tuple[Problem, ...]]:
     """The catalog of some DBC files, None when anything in them is an error; and every error and warning of all of them.
@@ -86,7 +96,8 @@ def build(sources: Sequence[Source],
     bindings: path of a source -> indexes of the buses it is bound to; messages of other sources are bound to none in
     particular and don't appear in `Catalog.buses`.
     """
-    return assemble([read(source) for source in sources], bindings)
+    assembly = assemble([read(source) for source in sources], bindings)
+    return assembly.catalog, assembly.problems
 
 
 def decode(data: bytes) -> str:
@@ -102,14 +113,14 @@ def read(source: Source) -> DbcFile:
     return dbc_file.read(source.path, source.text)
 
 
-def assemble(files: Sequence[DbcFile],
-             bindings: Mapping[str, Sequence[int]] | None = None) -> tuple[Catalog | None, tuple[Problem, ...]]:
+def assemble(files: Sequence[DbcFile], bindings: Mapping[str, Sequence[int]] | None = None) -> Assembly:
     """What `build` gives, of files already read."""
     builder = _Builder(files, bindings or {})
     catalog = builder.catalog()
-    problems = tuple(sorted(builder.problems, key=lambda problem: (problem.file, problem.line, problem.where, problem.column)))
-    return (None if any(problem.severity == "error" for problem in problems) else catalog), problems
-
+    order = {file.path: index for index, file in enumerate(files)}
+    problems = tuple(sorted(builder.problems, key=lambda p: (order[p.file], p.line, p.where, p.attribute, p.column)))
+    usable = not any(problem.severity == "error" for problem in problems)
+    return Assembly(catalog if usable else None, problems, len(catalog.messages), builder.alarm_count)
 
 
 class _Place:
@@ -187,6 +198,7 @@ class _Builder:
         self._files = files
         self._bindings = bindings
         self.problems: list[Problem] = [problem for file in files for problem in file.problems]
+        self.alarm_count = 0
 
     def catalog(self) -> Catalog:
         """The catalog, as far as it could be built."""
@@ -197,6 +209,7 @@ class _Builder:
         places = [(message, signal, self._place(file, message, signal)) for file, message in messages
                   for signal in message.signals]
         alarm_places = self._alarm_places(places)
+        self.alarm_count = len(alarm_places)
         scope = Scope((message for _, message in messages), {signal.name: message.name for message, signal, _ in alarm_places})
         alarms = [alarm for message, signal, place in alarm_places if (alarm := self._alarm(message, signal, place, scope))]
         self._check_codes(alarms)

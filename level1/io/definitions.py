@@ -37,11 +37,13 @@ class _Request(msgspec.Struct, frozen=True):
     bindings: dict[str, tuple[int, ...]] = {}
 
 
-class _Answer(msgspec.Struct, frozen=True):
-    """What the child found."""
+class Examination(msgspec.Struct, frozen=True):
+    """What files hold. catalog: None when there is any error. messages, alarms: how many, those with errors included."""
 
     catalog: Catalog | None
     problems: tuple[Problem, ...]
+    messages: int = 0
+    alarms: int = 0
 
 
 def load(files: Sequence[str | Path], bus_files: Mapping[int, Sequence[str | Path]] | None = None) -> Catalog:
@@ -50,15 +52,14 @@ def load(files: Sequence[str | Path], bus_files: Mapping[int, Sequence[str | Pat
     files: paths; a bare name that is no file in the current folder means a shipped one. bus_files: bus index -> the files
     bound to it, loaded as well when `files` doesn't name them; messages of the other files are bound to no bus in particular.
     """
-    catalog, problems = examine(files, bus_files)
-    if catalog is None:
-        raise DefinitionError(problems)
-    return catalog
+    found = examine(files, bus_files)
+    if found.catalog is None:
+        raise DefinitionError(found.problems)
+    return found.catalog
 
 
-def examine(files: Sequence[str | Path],
-            bus_files: Mapping[int, Sequence[str | Path]] | None = None) -> tuple[Catalog | None, tuple[Problem, ...]]:
-    """The catalog, None when there is any error; and every error and warning. Arguments as of `load`."""
+def examine(files: Sequence[str | Path], bus_files: Mapping[int, Sequence[str | Path]] | None = None) -> Examination:
+    """The catalog and every error and warning. Arguments as of `load`."""
     found: dict[str, str] = {}
     problems: list[Problem] = []
     for file in [*files, *(file for bound in (bus_files or {}).values() for file in bound)]:
@@ -70,9 +71,15 @@ def examine(files: Sequence[str | Path],
             found.setdefault(os.path.realpath(path), path)
     if not found:
         missing = Problem("ucs", 0, "", "", 0, "error", "no DBC file is given", "name at least one")
-        return None, tuple(problems) or (missing,)
+        return Examination(None, tuple(problems) or (missing,))
     answer = _ask(_Request(tuple((path, path) for path in found.values()), _bindings(found, bus_files or {})))
-    return None if problems else answer.catalog, (*problems, *answer.problems)
+    return _with(answer, problems)
+
+
+def _with(found: Examination, problems: Sequence[Problem]) -> Examination:
+    """The same, with errors of files that couldn't be read."""
+    catalog = None if problems else found.catalog
+    return Examination(catalog, (*problems, *found.problems), found.messages, found.alarms)
 
 
 def _find(file: str | Path) -> str:
@@ -112,7 +119,7 @@ def _bindings(found: Mapping[str, str], bus_files: Mapping[int, Sequence[str | P
 # -- the child ----------------------------------------------------------------------------------------------------------
 
 
-def _ask(request: _Request) -> _Answer:
+def _ask(request: _Request) -> Examination:
     """Lets a child do the work."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
     limit_s = _cpu_limit_s(path for _, path in request.files)
@@ -122,25 +129,25 @@ def _ask(request: _Request) -> _Answer:
     except subprocess.TimeoutExpired as error:
         return _failed(error.stderr or b"", f"takes more than {error.timeout:.0f} s to read")
     if child.returncode == 0:
-        return msgspec.msgpack.decode(child.stdout, type=_Answer)
+        return msgspec.msgpack.decode(child.stdout, type=Examination)
     reasons = {_OUT_OF_MEMORY: f"takes more than {MEMORY_LIMIT // 1_000_000} MB of memory to read",
                -24: f"takes more than {limit_s} s of computing time to read",
                -9: f"takes more than {limit_s} s of computing time to read"}
     return _failed(child.stderr, reasons.get(child.returncode, f"broke the DBC reader (exit code {child.returncode})"))
 
 
-def _failed(progress: bytes, reason: str) -> _Answer:
+def _failed(progress: bytes, reason: str) -> Examination:
     """The answer for a child that didn't come back; `progress`: what it wrote, the file at hand in the last such line."""
     lines = [line for line in progress.decode("utf-8", "replace").splitlines() if line.startswith("reading ")]
     file = lines[-1].removeprefix("reading ") if lines else "ucs"
-    return _Answer(None, (Problem(file, 0, "", "", 0, "error", reason, "it is hostile or broken: don't use it"),))
+    return Examination(None, (Problem(file, 0, "", "", 0, "error", reason, "it is hostile or broken: don't use it"),))
 
 
 def _cpu_limit_s(paths: Iterable[str]) -> int:
     return CPU_BASE_S + sum(min(os.path.getsize(path), MAX_FILE_BYTES) for path in paths) // CPU_BYTES_PER_S
 
 
-def _work(request: _Request) -> _Answer:
+def _work(request: _Request) -> Examination:
     from level1 import definitions
     files = []
     problems: list[Problem] = []
@@ -152,8 +159,7 @@ def _work(request: _Request) -> _Answer:
                                     f"at most {MAX_FILE_BYTES} are read"))
             continue
         files.append(definitions.read(definitions.Source(label, definitions.decode(Path(path).read_bytes()))))
-    catalog, found = definitions.assemble(files, request.bindings)
-    return _Answer(None if problems else catalog, (*problems, *found))
+    return _with(Examination(*definitions.assemble(files, request.bindings)), problems)
 
 
 def _main() -> int:
