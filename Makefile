@@ -36,7 +36,7 @@ test-wheel: $(VENV)/ready
 	for package in $(PACKAGES); do \
 	    if [ -d $$package/tests ]; then cp -r $$package/tests $$site/$$package/; fi; \
 	done && \
-	cp pyproject.toml $$site/ && cd $$site && \
+	cp pyproject.toml README.md $$site/ && cd $$site && \
 	$(CURDIR)/$(WHEEL_VENV)/bin/python -m pytest -q -m "not vcan" -p no:cacheprovider \
 	    $$(for package in $(PACKAGES); do if [ -d $$package/tests ]; then echo $$package/tests; fi; done)
 
