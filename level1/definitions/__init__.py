@@ -279,16 +279,17 @@ class _Builder:
     # -- alarms -------------------------------------------------------------------------------------------------------
 
     def _alarm_places(self, places: Iterable[tuple[Message, Signal, _Place]]) -> list[tuple[Message, Signal, _Place]]:
-        result: dict[str, tuple[Message, Signal, _Place]] = {}
+        first: dict[str, _Place] = {}
+        result: list[tuple[Message, Signal, _Place]] = []
         for message, signal, place in places:
             if not place.given("AlarmCode") and not place.given("AlarmWhen"):
                 self._check_lonely(place)
-            elif signal.name in result:
-                first = result[signal.name][2]
-                place.note("", f"alarm name is used twice, first in {first.path}:{first.line}", "names of alarms must differ")
-            else:
-                result[signal.name] = message, signal, place
-        return list(result.values())
+                continue
+            result.append((message, signal, place))
+            other = first.setdefault(signal.name, place)
+            if other is not place:
+                place.note("", f"alarm name is used twice, first in {other.path}:{other.line}", "names of alarms must differ")
+        return result
 
     def _check_lonely(self, place: _Place) -> None:
         lonely = [name for name in ATTRIBUTES if name.startswith(("Alarm", "Repair")) and place.given(name)]
