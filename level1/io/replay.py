@@ -24,11 +24,11 @@ from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from level1.frame import BUS_SHIFT, ERROR, EXTENDED, REMOTE, Frame
 from level1.io.error import OutsideError
+from level1.io.message import CLASSIC_BYTES, FD_BYTES, bounded, flagged_id, from_message
 
 if TYPE_CHECKING:
     import can
 
-CLASSIC_BYTES, FD_BYTES = 8, 64
 TOLD_LINES = 3
 """How many unreadable lines are told in words; all are counted."""
 HOPELESS_LINES = 1000
@@ -55,15 +55,18 @@ class LogError(OutsideError):
 class Log:
     """One recording. Iterate `frames` or `batches` once; the counts tell what was met so far.
 
-    channels: channel name -> bus index, `buses` first, every other in the order of appearance.
+    channels: channel name -> bus index, `buses` first, every other in the order of appearance; with `one_bus` every
+    channel not in `buses` is bus 0. channels_seen: those that frames came from.
     frames_read: frames handed on, error_frames and remote_frames among them. skipped: lines or objects left out, the
     first of them in words in `complaints`. first_ns, last_ns: first and highest time stamp.
     """
 
-    def __init__(self, path: str | Path, buses: Mapping[str, int] | None = None):
+    def __init__(self, path: str | Path, buses: Mapping[str, int] | None = None, *, one_bus: bool = False):
         """Open a recording and find out its format. Raises LogError when there is none, or of no known format."""
         self.path = Path(path)
         self.channels: dict[str, int] = dict(buses or {})
+        self.channels_seen: set[str] = set()
+        self._one_bus = one_bus
         self.frames_read = self.error_frames = self.remote_frames = self.skipped = 0
         self.first_ns = self.last_ns = 0
         self.complaints: list[str] = []
@@ -111,9 +114,10 @@ class Log:
 
     def bus(self, channel: str) -> int:
         """Index of the bus of a channel; a channel not seen before takes the lowest free one."""
-        if channel not in self.channels:
-            taken = set(self.channels.values())
-            self.channels[channel] = next(index for index in itertools.count() if index not in taken)
+        if channel not in self.channels_seen:
+            self.channels_seen.add(channel)
+            taken = () if self._one_bus else set(self.channels.values())
+            self.channels.setdefault(channel, next(index for index in itertools.count() if index not in taken))
         return self.channels[channel]
 
     def _reader(self) -> Callable[[], Iterator[Frame]]:
@@ -158,14 +162,14 @@ class Log:
             if not text or text.startswith(b"#"):
                 continue
             try:
-                t_ns, channel, flagged_id, data = candump_line(text)
+                t_ns, channel, plain_key, data = candump_line(text)
             except ValueError as error:
                 self._skip(f"unreadable line {number}: {error}")
                 continue
-            key = flagged_id | self.bus(channel.decode("utf-8", "replace")) << BUS_SHIFT
-            if not flagged_id & (ERROR | REMOTE):
-                keys.setdefault(channel, {})[b"%08X" % (flagged_id & 0x1FFFFFFF) if flagged_id & EXTENDED
-                                             else b"%03X" % flagged_id] = key
+            key = plain_key | self.bus(channel.decode("utf-8", "replace")) << BUS_SHIFT
+            if not plain_key & (ERROR | REMOTE):
+                keys.setdefault(channel, {})[b"%08X" % (plain_key & 0x1FFFFFFF) if plain_key & EXTENDED
+                                             else b"%03X" % plain_key] = key
             yield self._counted(t_ns, key, data)
 
     def _gvret(self) -> Iterator[Frame]:
@@ -179,7 +183,7 @@ class Log:
             try:
                 size = int(cells[length])
                 data = bytes(int(cell, 16) for cell in cells[length + 1:length + 1 + size])
-                can_id = _checked_id(int(cells[1], 16), cells[2].strip().lower() == b"true")
+                can_id = flagged_id(int(cells[1], 16), cells[2].strip().lower() == b"true")
                 if len(data) != size or size > FD_BYTES:
                     raise ValueError(f"{len(data)} of {size} data bytes")
                 if not cells[0].isdigit():
@@ -202,11 +206,11 @@ class Log:
                 channel = message.channel
                 name = str(channel + first_channel if isinstance(channel, int) else channel or "")
                 try:
-                    t_ns, flagged_id, data = from_message(message)
+                    t_ns, (key, data) = stamp_ns(message.timestamp), from_message(message)
                 except ValueError as error:
                     self._skip(f"unreadable frame {self.frames_read + self.skipped + 1}: {error}")
                     continue
-                yield self._counted(t_ns, flagged_id | self.bus(name) << BUS_SHIFT, data)
+                yield self._counted(t_ns, key | self.bus(name) << BUS_SHIFT, data)
 
     def _binary(self, reader: Callable[..., Iterable[can.Message]], suffix: str) -> Iterator[can.Message]:
         """Frames of a binary file, up to where it is damaged."""
@@ -310,7 +314,7 @@ def candump_line(line: bytes) -> tuple[int, bytes, int, bytes]:
 
 def _log_frame(name: bytes, payload: bytes) -> tuple[int, bytes]:
     """Flagged identifier and data of `ID#DATA`, `ID#R`, `ID##FDATA` (can-utils, lib.h)."""
-    can_id = _flagged_id(name)
+    can_id = _spelled_id(name)
     if payload.startswith(b"#"):
         return can_id, _data(payload[2:], FD_BYTES)
     if payload[:1] in (b"R", b"r"):
@@ -320,7 +324,7 @@ def _log_frame(name: bytes, payload: bytes) -> tuple[int, bytes]:
 
 def _screen_frame(name: bytes, length: bytes, rest: bytes) -> tuple[int, bytes]:
     """Flagged identifier and data of `ID [8] 11 22 …`; a length in two digits is CAN FD's."""
-    can_id = _flagged_id(name)
+    can_id = _spelled_id(name)
     if rest.startswith(b"remote request"):
         return can_id | REMOTE, b""
     match = _BYTES.fullmatch(rest)
@@ -332,20 +336,14 @@ def _screen_frame(name: bytes, length: bytes, rest: bytes) -> tuple[int, bytes]:
     return can_id, data
 
 
-def _flagged_id(name: bytes) -> int:
+def _spelled_id(name: bytes) -> int:
     """Identifier with the flags that its spelling means: 3 digits standard, 8 extended or an error frame."""
     value = int(name, 16)
     if len(name) == 8 and value >> 29 == 1:
         return value
     if len(name) not in (3, 8):
         raise ValueError(f"the identifier {name.decode()} has {len(name)} digits; candump writes 3 or 8")
-    return _checked_id(value, len(name) == 8)
-
-
-def _checked_id(value: int, extended: bool) -> int:
-    if value > (0x1FFFFFFF if extended else 0x7FF):
-        raise ValueError(f"the identifier {value:X} has more than {29 if extended else 11} bits")
-    return value | (EXTENDED if extended else 0)
+    return flagged_id(value, len(name) == 8)
 
 
 def _data(digits: bytes, limit: int) -> bytes:
@@ -353,9 +351,7 @@ def _data(digits: bytes, limit: int) -> bytes:
         data = unhexlify(digits)
     except ValueError:
         raise ValueError("data bytes are not pairs of hexadecimal digits") from None
-    if len(data) > limit:
-        raise ValueError(f"{len(data)} data bytes; a frame of this kind has at most {limit}")
-    return data
+    return bounded(data, limit)
 
 
 def _nanoseconds(seconds: bytes, fraction: bytes) -> int:
@@ -373,25 +369,11 @@ def _stamp(text: bytes | None) -> int:
     raise ValueError(f'unreadable time stamp "{text.decode("ascii", "replace")}"')
 
 
-def from_message(message: can.Message) -> tuple[int, int, bytes]:
-    """Time stamp in ns (rounded to the microsecond), flagged identifier and data of python-can's message.
-
-    Raises ValueError with what is wrong.
-    """
-    stamp, data = message.timestamp, bytes(message.data)
-    if not 0 <= stamp < 2**33:
-        raise ValueError(f"time stamp {stamp} out of range")
-    t_ns = round(stamp * 1_000_000) * 1000
-    if message.is_error_frame:
-        return t_ns, ERROR | message.arbitration_id & 0x1FFFFFFF, data
-    # Some BLF writers leave the flag out; an identifier of more than 11 bits can only be an extended one.
-    can_id = _checked_id(message.arbitration_id, message.is_extended_id or message.arbitration_id > 0x7FF)
-    if message.is_remote_frame:
-        return t_ns, can_id | REMOTE, b""
-    limit = FD_BYTES if message.is_fd else CLASSIC_BYTES
-    if len(data) > limit:
-        raise ValueError(f"{len(data)} data bytes; a frame of this kind has at most {limit}")
-    return t_ns, can_id, data
+def stamp_ns(stamp_s: float) -> int:
+    """A floating-point stamp of seconds in ns, rounded to the microsecond. Raises ValueError when it can't be one."""
+    if not 0 <= stamp_s < 2**33:
+        raise ValueError(f"time stamp {stamp_s} out of range")
+    return round(stamp_s * 1_000_000) * 1000
 
 
 def _open(path: Path) -> tuple[BinaryIO, int]:
