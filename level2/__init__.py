@@ -1,0 +1,1 @@
+"""A reference receiver for what units send: stores, acknowledges, commands."""
