@@ -6,13 +6,14 @@ multiplexer branch): its last payload, its time, its decoder. Frames and deadlin
 queues the *watches* (conditions) that read the cell, and `settle` evaluates each queued watch once, in a fixed order, when
 all signals of a frame are in place. Unchanged payloads only refresh the time of their page.
 
-Time never enters by counting frames: silence and age are deadlines (`timer`).
+Time never enters by counting frames: silence and age are deadlines (`timer`). A frame moves none of them: a *watchdog* looks
+now and then which messages may fall silent before it looks again, and gives only those a deadline of their own.
 """
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from level1.catalog import STALE_CYCLES, Catalog, Message, Signal
@@ -28,11 +29,12 @@ from level1.decode import (
     float_quality,
     raw_of,
 )
-from level1.frame import BUS_SHIFT, EXTENDED, frame_key, j1939_pgn
+from level1.frame import BUS_SHIFT, EXTENDED, REMOTE, frame_key, j1939_pgn
+from level1.frame import ERROR as ERROR_FRAME
+from level1.protection import Protection
 from level1.timer import FAR, Timers
 
-QUALITIES = 7
-BAD = (0, 2, 3, 2, 2, 3, 3)
+BAD = (0, 2, 3, 2, 2, 3, 3, 3)
 """Verdict a quality forces on arithmetic: 0 none, 2 STALE, 3 ERROR (numbers of `condition.Verdict`)."""
 ALWAYS: Any = object()
 """Stands for a last payload that equals no other: every frame is decoded."""
@@ -94,10 +96,11 @@ class Cell:
 
 class Page:
     """A message as received. seen: its last payload (None: none yet, or none for so long that it counts as silent;
-    ALWAYS: decode every frame). level: how many of `limits` (ns of silence, rising) have passed; -1 before the first frame."""
+    ALWAYS: decode every frame). integrity: class = quality that counter and checksum give. level: how many of `limits`
+    (ns of silence, rising) have passed; -1 before the first frame."""
 
-    __slots__ = ("always", "board", "branches", "cells", "data", "due", "handle", "key", "level", "limits", "message", "order",
-                 "others", "owner", "presence", "seen", "selector", "stale_level", "t_ns")
+    __slots__ = ("always", "board", "branches", "cells", "data", "decode", "due", "handle", "integrity", "level", "limits", "message",
+                 "order", "others", "owner", "presence", "protection", "seen", "selector", "stale_level", "t_ns", "watchdog")
 
     def __init__(self, board: Board, message: Message):
         self.board = board
@@ -111,13 +114,17 @@ class Page:
         self.limits: list[int] = []
         self.stale_level = 0
         self.presence = Cell(message.name, 0)
-        self.always = False
+        self.integrity = Cell(message.name, NEVER)
+        self.protection = Protection.of(message)
+        self.always = self.protection is not None
         self.cells: list[Cell] = []
         self.handle: Callable[[int, bytes], None] = _ignore
+        self.decode: Callable[[int, bytes], None] = _ignore
         self.branches: dict[str, list[Page]] = {}
         self.selector: tuple[Signal, frozenset[int]] | None = None
         self.owner: int | None = None
         self.others: list[int] = []
+        self.watchdog: Watchdog | None = None
 
     def receive(self, t_ns: int, data: bytes) -> None:
         """A frame of this message; `Board.receive_many` has the same in line."""
@@ -135,20 +142,21 @@ class Page:
         """First frame, or first after a silence."""
         self.level = 0
         self.move_presence(0)
-        if self.limits:
+        if self.protection is not None:
+            self.protection.restart()
+        if self.watchdog is not None:
             self.board.timers.set(self, self.t_ns + self.limits[0])
+            self.watchdog.wake(self.t_ns)
 
     def expire(self, now_ns: int) -> None:
-        """A limit of silence may have passed; frames since then only moved `t_ns`."""
-        due = self.t_ns + self.limits[self.level]
-        if due > now_ns:
-            self.board.timers.set(self, due)
+        """A limit of silence has passed, unless frames have moved `t_ns` since: then the watchdog sees to the next deadline."""
+        if self.t_ns + self.limits[self.level] > now_ns:
             return
         self.level += 1
         self.move_presence(self.level)
         if self.level == self.stale_level:
             self.board.lose(self)
-        if self.limits and self.level < len(self.limits):
+        if self.level < len(self.limits):
             self.board.timers.set(self, self.t_ns + self.limits[self.level])
         self.seen = None
 
@@ -158,6 +166,31 @@ class Page:
             self.presence.k = k
             self.board.queue(self.presence)
 
+    def check(self, t_ns: int, data: bytes) -> None:
+        """Decode a protected frame if its counter and checksum are right; else its signals are errors."""
+        assert self.protection is not None
+        quality = self.protection.check(data)
+        self.move_integrity(quality)
+        if quality == GOOD:
+            self.decode(t_ns, data)
+            return
+        self.board.counters["frames with a wrong counter or checksum"] += 1
+        for cell in self.all_cells():
+            self.board.spoil(cell, quality)
+
+    def all_cells(self) -> Iterator[Cell]:
+        """Its signals, those of its multiplexer branches too."""
+        yield from self.cells
+        for pages in self.branches.values():
+            for page in pages:
+                yield from page.all_cells()
+
+    def move_integrity(self, k: int) -> None:
+        """Enter a class of integrity."""
+        if self.integrity.k != k:
+            self.integrity.k = k
+            self.board.queue(self.integrity)
+
     def select(self, t_ns: int, data: bytes) -> None:
         """Hand the frame to the branches its multiplexers name."""
         for pages in self.branches.values():
@@ -165,6 +198,42 @@ class Page:
                 assert page.selector is not None
                 if raw_of(page.selector[0], data) in page.selector[1]:
                     page.receive(t_ns, data)
+
+
+class Watchdog:
+    """Watches over all pages with the same first limit of silence, so that their frames need not move a deadline.
+
+    It makes two rounds within a limit. A page whose limit ends by the next round gets its exact deadline; the others, on a
+    healthy bus all of them, cost one comparison a round. It rests while all of its pages are silent.
+    """
+
+    __slots__ = ("due", "limit_ns", "order", "pages", "period_ns", "timers")
+
+    def __init__(self, timers: Timers, limit_ns: int):
+        self.timers = timers
+        self.order = timers.order()
+        self.due = FAR
+        self.limit_ns = limit_ns
+        self.period_ns = max(1, limit_ns // 2)
+        self.pages: list[Page] = []
+
+    def wake(self, t_ns: int) -> None:
+        """A page has been heard again."""
+        if self.due == FAR:
+            self.timers.set(self, t_ns + self.period_ns)
+
+    def expire(self, now_ns: int) -> None:
+        """Make a round."""
+        next_ns = now_ns + self.period_ns
+        last_heard_ns = next_ns - self.limit_ns
+        awake = False
+        for page in self.pages:
+            if page.level == 0:
+                awake = True
+                if page.t_ns <= last_heard_ns:
+                    self.timers.set(page, page.t_ns + self.limit_ns)
+        if awake:
+            self.timers.set(self, next_ns)
 
 
 class Held:
@@ -327,6 +396,7 @@ class Board:
 
     def set_limits(self) -> None:
         """Fix the silence limits of every page: those that conditions named, and the one at which its values are stale."""
+        watchdogs: dict[int, Watchdog] = {}
         for page in [*self.pages.values(), *self.branches.values()]:
             stale = self.stale_after(page)
             if stale is not None:
@@ -334,6 +404,9 @@ class Board:
             page.limits = sorted(set(page.limits))
             page.stale_level = page.limits.index(stale) + 1 if stale is not None else 0
             page.presence.k = len(page.limits) + 1
+            if page.limits:
+                page.watchdog = watchdogs.setdefault(page.limits[0], Watchdog(self.timers, page.limits[0]))
+                page.watchdog.pages.append(page)
 
     def stale_after(self, page: Page) -> int | None:
         """Silence after which the values of a page are stale, ns; None for a message without cycle time.
@@ -354,6 +427,8 @@ class Board:
             every = {cell.signal.name for cell in page.cells if cell.rate is not None}
             page.handle = compile_handler(page.message, [(cell.signal, cell) for cell in page.cells], self.touch,
                                           self._short_of(page), every, page.select if page.branches else None)
+            if page.protection is not None and page.selector is None:
+                page.decode, page.handle = page.handle, page.check
         for name in self.pages:
             message = self.catalog.messages[name]
             for bus in self.catalog.buses.get(name, (0,)):
@@ -374,7 +449,7 @@ class Board:
         page = None
         if key in self._by_key:
             page = self.pages[self._by_key[key][0]]
-        elif key & EXTENDED:
+        elif key & EXTENDED and not key & (REMOTE | ERROR_FRAME):
             candidates = self._by_pgn.get((key >> BUS_SHIFT, j1939_pgn(key & 0x1FFF_FFFF)), [])
             source = key & 0xFF
             for wanted, name in candidates:
@@ -426,7 +501,7 @@ class Board:
                 self.queued.append(watch)
 
     def spoil(self, cell: Cell, quality: int) -> None:
-        """A signal has no raw value any more: NEVER, OLD, SHORT or CORRUPT."""
+        """A signal has no raw value any more: NEVER, OLD, SHORT, CORRUPT or FROZEN."""
         cell.k = cell.base + quality
         cell.lo, cell.hi, cell.raw = 1, 0, None
         cell.bad = BAD[quality]
@@ -438,6 +513,7 @@ class Board:
 
     def lose(self, page: Page) -> None:
         """A page has become stale: so have its signals; a J1939 message is free for another source."""
+        page.move_integrity(OLD)
         for cell in page.cells:
             self.spoil(cell, OLD)
         if page.owner is not None:

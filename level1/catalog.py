@@ -25,7 +25,7 @@ class Signal(msgspec.Struct, frozen=True):
     physical = raw * factor + offset. minimum, maximum: physical limits, None where the file gives [0|0].
     choices: value table, raw -> name. initial_raw: GenSigStartValue, what a command holds before anyone commanded it.
     multiplexer_ids: None for a signal that is always there; else the values of `multiplexer_signal` at which it is.
-    role: None, Counter or Checksum (end-to-end protection).
+    role: None, Counter or Checksum (end-to-end protection); checksum: algorithm, a key of `protection.CHECKSUMS`.
     """
 
     name: str
@@ -45,6 +45,7 @@ class Signal(msgspec.Struct, frozen=True):
     multiplexer_signal: str | None = None
     multiplexer_ids: tuple[int, ...] | None = None
     role: str = "None"
+    checksum: str = "CRC8_SAE_J1850"
     comment: str = ""
 
 

@@ -15,7 +15,7 @@ from fractions import Fraction
 from typing import Any, Literal
 
 from level1.board import BAD, Board, Cell
-from level1.decode import CORRUPT, ERROR, GOOD, NEVER, OLD, SHORT, UNAVAILABLE
+from level1.decode import CORRUPT, ERROR, FROZEN, GOOD, NEVER, OLD, SHORT, UNAVAILABLE
 from level1.expression import (
     AlarmState,
     And,
@@ -302,6 +302,9 @@ class Compiler:
         return self._table(cell, verdicts + list(BAD))
 
     def _quality(self, node: Quality) -> str:
+        if node.kind in ("corrupt", "frozen"):
+            wanted = CORRUPT if node.kind == "corrupt" else FROZEN
+            return self._table(self.board.page(node.message).integrity, _quality_table((wanted,), (NEVER, OLD)))
         if not node.signal:
             page = self.board.page(node.message)
             return self._table(page.presence, [F] * (len(page.limits) + 1) + [T])
@@ -365,11 +368,11 @@ class Compiler:
 
 
 def _quality_table(true: tuple[int, ...], unknown: tuple[int, ...]) -> list[int]:
-    return [T if q in true else S if q in unknown else F for q in (GOOD, UNAVAILABLE, ERROR, NEVER, OLD, SHORT, CORRUPT)]
+    return [T if q in true else S if q in unknown else F for q in (GOOD, UNAVAILABLE, ERROR, NEVER, OLD, SHORT, CORRUPT, FROZEN)]
 
 
 QUALITY_TABLES = {
-    "error": _quality_table((ERROR, SHORT, CORRUPT), (NEVER, OLD)),
+    "error": _quality_table((ERROR, SHORT, CORRUPT, FROZEN), (NEVER, OLD)),
     "unavailable": _quality_table((UNAVAILABLE,), (NEVER, OLD)),
     "never": _quality_table((NEVER,), ()),
 }

@@ -20,11 +20,12 @@ from typing import Any
 
 from level1.catalog import Message, Signal
 
-GOOD, UNAVAILABLE, ERROR, NEVER, OLD, SHORT, CORRUPT = range(7)
+GOOD, UNAVAILABLE, ERROR, NEVER, OLD, SHORT, CORRUPT, FROZEN = range(8)
 """Quality of a sample: as it should be; J1939 not available; reserved error value, NaN or outside the DBC's limits;
-never received; older than `catalog.STALE_CYCLES` cycles; the frame was too short for it; counter or checksum wrong."""
+never received; older than `catalog.STALE_CYCLES` cycles; the frame was too short for it; checksum or counter wrong;
+counter stands still."""
 
-QUALITY_WORDS = ("good", "unavailable", "error", "never", "stale", "error", "error")
+QUALITY_WORDS = ("good", "unavailable", "error", "never", "stale", "short", "corrupt", "frozen")
 """The word an event shows for a quality."""
 
 RawValue = int | float

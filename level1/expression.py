@@ -74,9 +74,10 @@ class Silent(Node, frozen=True):
 
 class Quality(Node, frozen=True):
     """`error(x)`, `unavailable(x)`: what the last received sample says (STALE when there is none or it is too old);
-    `never(x)`: never received (always known). For `never(Message)` the signal is ""."""
+    `never(x)`: never received (always known). `corrupt(Message)`, `frozen(Message)`: what its counter and checksum say.
+    Where it is asked of a message, the signal is ""."""
 
-    kind: Literal["error", "unavailable", "never"]
+    kind: Literal["error", "unavailable", "never", "corrupt", "frozen"]
     message: str
     signal: str
 
