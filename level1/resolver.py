@@ -11,8 +11,9 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Literal
 
-from level1 import language, similar
+from level1 import language, reach, similar
 from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, STALE_CYCLES, Command, Message, Signal
+from level1.decode import UNAVAILABLE, raw_range, reserved
 from level1.expression import (
     AlarmState,
     And,
@@ -38,7 +39,7 @@ from level1.expression import (
     WaitStep,
 )
 from level1.language import LanguageError, Name, Syntax
-from level1.scaling import exact_decimal, float_bits, physical, plain, raw_range
+from level1.scaling import exact_decimal, float_bits, physical, plain
 
 STATES: Mapping[str, int] = {"Normal": NORMAL, "Active": ACTIVE, "Repairing": REPAIRING, "LockedOut": LOCKED_OUT}
 """Names of an alarm's states (DESIGN §3)."""
@@ -270,6 +271,8 @@ class _Resolution:
             return self.error(syntax.right, "division by zero")
         if left.value is not None and right.value is not None:
             return _constant(_FOLD[syntax.op](left.value, right.value))
+        if syntax.op == "/" and right.value is None and Fraction(0) in reach.interval(right.node, self.scope.messages):
+            self.warning(syntax.right, "the divisor can become 0; the condition is an error then", "exclude 0 by its limits")
         if syntax.op in "+-":
             self._compare_units(syntax, left, right)
         unit = left.unit or right.unit if syntax.op in "+-" else ""
@@ -308,7 +311,22 @@ class _Resolution:
             self.warning(syntax, f"compares two constants: always {'true' if verdict else 'false'}")
             return Typed("boolean", Boolean(verdict))
         self._compare_units(syntax, left, right)
-        return Typed("boolean", _compare(syntax.op, left.node, right.node))
+        node = _compare(syntax.op, left.node, right.node)
+        self._check_reach(syntax, node, left, right)
+        return Typed("boolean", node)
+
+    def _check_reach(self, syntax: language.Comparison, node: Compare, left: Typed, right: Typed) -> None:
+        """Notes a comparison that always comes out the same."""
+        verdicts = reach.verdicts(node, self.scope.messages)
+        if len(verdicts) == 2:
+            return
+        pair, limit = (left.signal, right.value) if left.signal else (right.signal, left.value)
+        why = f": {reach.describe(*pair)}" if pair else ""
+        hint = _reach_hint(*pair, limit) if pair and limit is not None else ""
+        if True in verdicts:
+            self.warning(syntax, f"always holds{why}", hint)
+        else:
+            self.error(syntax, f"can never hold{why}", hint)
 
     def _operand(self, syntax: Syntax, other: Syntax) -> Typed:
         """One side of a comparison: value-table names and true/false mean what they mean to the other side."""
@@ -440,8 +458,20 @@ class _Resolution:
                 return WaitStep(duration.ns)
             case language.Expect(condition=condition, within=within):
                 node = self.condition(condition)
+                self._check_senders(condition)
                 return ExpectStep(node, within.ns, text[condition.start:condition.end].strip()) if node else None
         raise TypeError(type(syntax).__name__)
+
+    def _check_senders(self, condition: Syntax) -> None:
+        """What a repair expects has to be told by somebody else, or it proves nothing."""
+        pairs = [(name, pair) for name in language.names(condition) if (pair := self.scope.only(name))]
+        if any(set(message.senders) - {"UCS"} or self.scope.is_alarm(message, signal) for _, (message, signal) in pairs):
+            return
+        for name, (message, _) in pairs:
+            if not message.senders:
+                self.warning(name, f"nobody sends {message.name}, so the repair expects in vain", "name its sender in its BO_ line")
+            else:
+                self.warning(name, f"only UCS sends {message.name}: that proves nothing", "expect what another node reports")
 
     def _own_message(self, name: Name) -> Message | None:
         message = self.scope.messages.get(name.text) if not name.owner else None
@@ -530,7 +560,7 @@ class _Resolution:
             return 0
 
     def _fitting(self, signal: Signal, raw: int, syntax: Syntax) -> int:
-        low, high = raw_range(max(1, signal.length), signal.signed)
+        low, high = raw_range(signal)
         if not low <= raw <= high and not signal.is_float:
             self.error(syntax, f"raw value {raw} doesn't fit the {signal.length} bits of {signal.name}", f"{low} to {high}")
         return raw
@@ -579,11 +609,22 @@ def _silent(resolution: _Resolution, call: language.Call) -> Typed:
                                 _message_hint(resolution.scope, name))
     if len(call.arguments) == 2:
         limit = resolution.duration_argument(call, 1)
-        return Typed("boolean", Silent(message.name, limit)) if limit else UNKNOWN
+        if limit is None:
+            return UNKNOWN
+        _check_silence(resolution, call, message, limit)
+        return Typed("boolean", Silent(message.name, limit))
     if message.cycle_ns is None:
         return resolution.error(call, f"{message.name} has no cycle time, so silence needs a limit",
                                 f"write silent({message.name}, 1 s) or set GenMsgCycleTime")
     return Typed("boolean", Silent(message.name, STALE_CYCLES * message.cycle_ns))
+
+
+def _check_silence(resolution: _Resolution, call: language.Call, message: Message, limit_ns: int) -> None:
+    if message.cycle_ns is None:
+        resolution.warning(call, f"{message.name} has no cycle time: silence may be normal", "set GenMsgCycleTime")
+    elif limit_ns <= message.cycle_ns:
+        resolution.error(call.arguments[1], f"{message.name} comes every {message.cycle_ns / 1_000_000:g} ms, so it would count "
+                         "as silent between two frames", f"at least {STALE_CYCLES * message.cycle_ns / 1_000_000:g} ms")
 
 
 def _message_hint(scope: Scope, syntax: Syntax) -> str:
@@ -706,6 +747,23 @@ def _is_flag(message: Message, signal: Signal) -> bool:
         return True
     limited = signal.minimum == 0 and signal.maximum == 1
     return not signal.choices and (limited or (message.j1939 and signal.length == 2))
+
+
+def _reach_hint(message: Message, signal: Signal, limit: Fraction) -> str:
+    """What to write instead of a comparison with a value that never counts as good."""
+    raw = (limit - Fraction(signal.offset)) / Fraction(signal.factor)
+    low, high = raw_range(signal)
+    if signal.is_float or not low <= raw <= high:
+        return ""
+    if raw.denominator != 1:
+        return f"it comes in steps of {signal.factor}"
+    for first, last, quality in reserved(signal) if message.j1939 else ():
+        if first <= raw <= last:
+            word = "unavailable" if quality == UNAVAILABLE else "error"
+            return f"J1939 reserves that value: write {word}({message.name}.{signal.name})"
+    if limit not in reach.signal_interval(message, signal):
+        return f"values beyond the signal's limits count as error: widen them or write error({message.name}.{signal.name})"
+    return ""
 
 
 def _given(values: Mapping[str, int | None]) -> dict[str, int]:

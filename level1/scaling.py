@@ -13,11 +13,6 @@ FLOAT_LENGTHS = (16, 32, 64)
 _FORMATS = {16: ">e", 32: ">f", 64: ">d"}
 
 
-def raw_range(length: int, signed: bool) -> tuple[int, int]:
-    """Smallest and largest raw value of an integer signal of at least one bit."""
-    return (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
-
-
 def float_bits(value: float, length: int) -> int:
     """Raw value of a floating point signal: its IEEE 754 bits. Raises OverflowError when the value is too large for them."""
     return int.from_bytes(struct.pack(_FORMATS[length], value), "big")

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from level1 import resolver, similar
+from level1 import check, resolver, similar
 from level1.catalog import Alarm, Catalog, Command, Message, Problem, Repair, Signal
 from level1.definitions import dbc_file
 from level1.definitions.dbc_file import Attribute, DbcFile
@@ -213,6 +213,8 @@ class _Builder:
         scope = Scope((message for _, message in messages), {signal.name: message.name for message, signal, _ in alarm_places})
         alarms = [alarm for message, signal, place in alarm_places if (alarm := self._alarm(message, signal, place, scope))]
         self._check_codes(alarms)
+        for alarm in alarms:
+            self._take_doubts(alarm, scope.messages)
         return Catalog(
             files=tuple(file.path for file in self._files),
             messages={message.name: message for _, message in messages},
@@ -377,6 +379,15 @@ class _Builder:
                 place = self._place_of(alarm)
                 place.note("AlarmCode", f"code {alarm.code} is used twice, first by {other.name} in {other.file}:{other.line}",
                            f"{_free_code(alarm.code, first)} is free")
+
+    def _take_doubts(self, alarm: Alarm, messages: Mapping[str, Message]) -> None:
+        """What is doubtful in an alarm as a whole; nothing of an attribute in which an error is known already."""
+        place = self._place_of(alarm)
+        where = ".".join(place.owner)
+        wrong = {(p.file, p.where, p.attribute) for p in self.problems if p.severity == "error"}
+        for doubt in check.doubts(alarm, messages):
+            if (alarm.file, where, doubt.attribute) not in wrong:
+                place.note(doubt.attribute, doubt.message, doubt.hint, doubt.severity, text=place.text(doubt.attribute))
 
     def _place_of(self, alarm: Alarm) -> _Place:
         file = next(file for file in self._files if file.path == alarm.file)

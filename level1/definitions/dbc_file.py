@@ -5,6 +5,8 @@ a `Problem`. Pure: text in, values out.
 """
 from __future__ import annotations
 
+import contextlib
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -12,14 +14,16 @@ from decimal import Decimal
 from typing import TYPE_CHECKING, Any
 
 import cantools.database.can
+import msgspec
 from cantools.database.errors import Error as CantoolsError
 from textparser import ParseError
 
 from level1 import dbc_text, similar
 from level1.catalog import Message, Problem, Signal
 from level1.dbc_text import EXTENDED_ID, UNUSED_MESSAGE, DbcText, EntryText, MessageText, SignalText
+from level1.decode import raw_range
 from level1.frame import j1939_pgn
-from level1.scaling import FLOAT_LENGTHS, float_bits, raw_range
+from level1.scaling import FLOAT_LENGTHS, float_bits
 
 if TYPE_CHECKING:
     from cantools.database.can.message import Message as DbcMessage
@@ -221,14 +225,15 @@ class _Reader:
             self._problem(text.line, f"a floating point signal can't have {parsed.length} bits", "16, 32 or 64", where=where)
         elif not _fits(parsed, message.length):
             self._problem(text.line, f"doesn't fit into its message of {message.length} bytes", where=where)
-        return Signal(
-            name=parsed.name, start=parsed.start, length=parsed.length, big_endian=parsed.byte_order == "big_endian",
-            signed=parsed.is_signed, is_float=is_float, factor=factor, offset=offset, minimum=minimum, maximum=maximum,
-            unit=parsed.unit or "", choices={int(raw): str(name) for raw, name in (parsed.choices or {}).items()},
-            initial_raw=self._initial_raw(where, parsed, is_float, text), is_multiplexer=bool(parsed.is_multiplexer),
-            multiplexer_signal=parsed.multiplexer_signal,
+        signal = Signal(  # with an error noted, any usable value does: later checks shall find the other mistakes
+            name=parsed.name, start=parsed.start, length=max(1, parsed.length), big_endian=parsed.byte_order == "big_endian",
+            signed=parsed.is_signed, is_float=is_float, factor=factor or Decimal(1), offset=offset, minimum=minimum,
+            maximum=maximum, unit=parsed.unit or "",
+            choices={int(raw): str(name) for raw, name in (parsed.choices or {}).items()},
+            is_multiplexer=bool(parsed.is_multiplexer), multiplexer_signal=parsed.multiplexer_signal,
             multiplexer_ids=None if parsed.multiplexer_ids is None else tuple(sorted(parsed.multiplexer_ids)),
             comment=parsed.comment or "")
+        return msgspec.structs.replace(signal, initial_raw=self._initial_raw(where, signal, parsed.raw_initial, text.line))
 
     def _limits(self, where: str, text: SignalText) -> tuple[Decimal | None, Decimal | None]:
         minimum, maximum = dbc_text.decimal(text.minimum), dbc_text.decimal(text.maximum)
@@ -240,18 +245,19 @@ class _Reader:
             return None, None
         return minimum, maximum
 
-    def _initial_raw(self, where: str, parsed: DbcSignal, is_float: bool, text: SignalText) -> int:
-        initial = parsed.raw_initial
-        if initial is None or parsed.length < 1:
+    def _initial_raw(self, where: str, signal: Signal, initial: int | float | None, line: int) -> int:
+        if initial is None:
             return 0
-        if is_float and parsed.length in FLOAT_LENGTHS:
-            return float_bits(float(initial), parsed.length)
-        low, high = raw_range(parsed.length, parsed.is_signed)
-        if int(initial) != initial or not low <= initial <= high:
-            self._problem(text.line, f"start value {initial} is no raw value of {parsed.length} bits: 0 is taken", where=where,
-                          attribute="GenSigStartValue", severity="warning")
-            return 0
-        return int(initial)
+        if signal.is_float and signal.length in FLOAT_LENGTHS:
+            with contextlib.suppress(OverflowError):
+                return float_bits(float(initial), signal.length)
+        elif math.isfinite(initial) and int(initial) == initial:
+            low, high = raw_range(signal)
+            if low <= initial <= high:
+                return int(initial)
+        self._problem(line, f"start value {initial} is no raw value of {signal.length} bits: 0 is taken", where=where,
+                      attribute="GenSigStartValue", severity="warning")
+        return 0
 
     def _find_overlaps(self, message: DbcMessage, text: MessageText, signals: tuple[Signal, ...]) -> None:
         """Overlapping signals are no error: real files do that on purpose for variants of a message."""
