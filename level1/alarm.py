@@ -15,7 +15,7 @@ steps are done. What the repair does is in `repair`.
 """
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 from level1 import catalog
 from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING
@@ -85,10 +85,11 @@ class AlarmMachine:
     """One alarm at run time. state: NORMAL, ACTIVE, REPAIRING or LOCKED_OUT (`catalog`); zone: the last one told.
 
     instance: seq of the `raised` event of the present activation, 0 in NORMAL. acknowledged, unlocked: by people, since then.
+    key, detail, text: of one of many causes that a subsystem reports itself (a trouble code), empty for a condition's alarm.
     """
 
-    __slots__ = ("acknowledged", "calm", "definition", "delay", "due", "episode", "host", "instance", "order", "state", "unlocked",
-                 "zone")
+    __slots__ = ("acknowledged", "calm", "definition", "delay", "detail", "due", "episode", "host", "instance", "key", "order",
+                 "state", "text", "unlocked", "zone")
 
     def __init__(self, definition: catalog.Alarm, host: Host, timers: Timers):
         self.definition = definition
@@ -103,6 +104,9 @@ class AlarmMachine:
         self.acknowledged = False
         self.unlocked = False
         self.episode: Episode | None = None
+        self.key = ""
+        self.detail: dict[str, Any] = {}
+        self.text = definition.cause or definition.when_text
 
     def zone_changed(self, t_ns: int, zone: int) -> None:
         """The conditions have moved the alarm to another zone."""
@@ -145,7 +149,7 @@ class AlarmMachine:
         if self.state == NORMAL:
             self.state = ACTIVE
             self.calm = self.acknowledged = self.unlocked = False
-            self.instance = self.host.emit(self, now_ns, "raised", self.definition.cause or self.definition.when_text)
+            self.instance = self.host.emit(self, now_ns, "raised", self.text)
             self.host.counted(self, now_ns)
             self.host.moved(self, now_ns)
             if self.episode is not None:

@@ -99,8 +99,8 @@ class Page:
     ALWAYS: decode every frame). integrity: class = quality that counter and checksum give. level: how many of `limits`
     (ns of silence, rising) have passed; -1 before the first frame."""
 
-    __slots__ = ("always", "board", "branches", "cells", "data", "decode", "due", "handle", "integrity", "level", "limits", "message",
-                 "order", "others", "owner", "presence", "protection", "seen", "selector", "stale_level", "t_ns", "watchdog")
+    __slots__ = ("always", "board", "branches", "cells", "data", "decode", "due", "handle", "integrity", "level", "limits",
+                 "message", "order", "others", "owner", "presence", "protection", "seen", "selector", "stale_level", "t_ns", "watchdog")
 
     def __init__(self, board: Board, message: Message):
         self.board = board
@@ -236,6 +236,30 @@ class Watchdog:
             self.timers.set(self, next_ns)
 
 
+class Tap:
+    """Listens to every frame of a parameter group and hands it on to the page of the identifier, if it has one.
+
+    It stands in the table of identifiers like a page that decodes every frame.
+    """
+
+    __slots__ = ("always", "data", "handle", "seen", "t_ns")
+
+    def __init__(self, key: int, listen: Callable[[int, int, bytes], None], page: Page | None):
+        self.always = True
+        self.data = b""
+        self.t_ns = 0
+        self.seen: Any = ALWAYS
+
+        def handle(t_ns: int, data: bytes) -> None:
+            listen(t_ns, key, data)
+            if page is not None:
+                page.receive(t_ns, data)
+        self.handle = handle
+
+    def heard(self) -> None:
+        """A tap never counts as silent."""
+
+
 class Held:
     """How long the value of an exact cell has been the same: a cell whose class is the number of limits passed."""
 
@@ -321,7 +345,8 @@ class Board:
         self.cells: dict[str, Cell] = {}
         self.pages: dict[str, Page] = {}
         self.branches: dict[tuple[str, str, tuple[int, ...]], Page] = {}
-        self.table: dict[int, Page | None] = {}
+        self.table: dict[int, Page | Tap | None] = {}
+        self.listeners: dict[int, Callable[[int, int, bytes], None]] = {}
         self.queued: list[Watch] = []
         self.watches = 0
         self._by_key: dict[int, list[str]] = {}
@@ -440,12 +465,38 @@ class Board:
 
     # --- running ----------------------------------------------------------------------------------------------------------
 
-    def bind(self, key: int) -> Page | None:
+    def listen(self, pgn: int, listener: Callable[[int, int, bytes], None]) -> None:
+        """Have listener(t_ns, key, data) called for every frame of a J1939 parameter group."""
+        self.listeners[pgn] = listener
+
+    def deliver(self, t_ns: int, key: int, data: bytes) -> None:
+        """A message that came in several frames, as if it had come in one."""
+        page = self.table[key] if key in self.table else self.bind(key)
+        if isinstance(page, Page):
+            page.receive(t_ns, data)
+        elif page is not None:
+            page.handle(t_ns, data)
+
+    def bind(self, key: int) -> Page | Tap | None:
         """Find the page of an identifier heard for the first time, and remember it; None: no definition asks for it.
 
         A J1939 message with any source address belongs to the first source that sends it, until that one falls silent:
         two sources that alternate must not make its values flap.
         """
+        page: Page | Tap | None = self._find(key)
+        if key & EXTENDED and not key & (REMOTE | ERROR_FRAME):
+            listener = self.listeners.get(j1939_pgn(key & 0x1FFF_FFFF))
+            if listener is not None:
+                page = Tap(key, listener, page if isinstance(page, Page) else None)
+        if page is None:
+            self.counters["ids nobody asks for"] += 1
+            if len(self.table) >= MAX_KEYS:
+                for nobodys in [known for known, kept in self.table.items() if kept is None]:
+                    del self.table[nobodys]
+        self.table[key] = page
+        return page
+
+    def _find(self, key: int) -> Page | None:
         page = None
         if key in self._by_key:
             page = self.pages[self._by_key[key][0]]
@@ -458,12 +509,6 @@ class Board:
             for wanted, name in candidates:
                 if page is None and wanted is None:
                     page = self._claim(self.pages[name], key)
-        if page is None:
-            self.counters["ids nobody asks for"] += 1
-            if len(self.table) >= MAX_KEYS:
-                for nobodys in [known for known, kept in self.table.items() if kept is None]:
-                    del self.table[nobodys]
-        self.table[key] = page
         return page
 
     def _claim(self, page: Page, key: int) -> Page | None:

@@ -7,7 +7,7 @@ it comes frame by frame or in batches. A time stamp that runs backwards is clamp
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 from itertools import chain
@@ -36,20 +36,30 @@ from level1.expression import (
     Silent,
     Step,
 )
-from level1.frame import Frame, frame_key
+from level1.frame import BUS_SHIFT, Frame, frame_key
 from level1.gate import Gate, Refused
+from level1.j1939 import DM1, FMI_WORDS, TP_CM, TP_DT, Transport, TroubleCodeReport, parse_dm1
 from level1.repair import RepairMachine
 from level1.timer import FAR, Timed, Timers
 
 STATE_WORDS = ("Normal", "Active", "Repairing", "LockedOut")
+TROUBLE_CODE = "TroubleCode"
+"""Alarm of `ucs.dbc` whose causes are the active trouble codes of all senders."""
 UNTOLD = -1
 """Outcome of a condition before its first evaluation: whatever it is then, its alarm is told."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _MISSING: Any = object()
 
 
+MAX_INSTANCES = 256
+"""Causes at one time of an alarm that subsystems report; more are counted, not kept: a babbling node must not fill the memory."""
+
+
 class AlarmMemory(msgspec.Struct, frozen=True):
-    """What survives a restart of one alarm. begun_ago_ns, raised_ago_ns: ages of attempts and activations when it was stored."""
+    """What survives a restart of one alarm, or of one reported cause of it.
+
+    begun_ago_ns, raised_ago_ns: ages of attempts and activations when it was stored.
+    """
 
     name: str
     state: int
@@ -58,6 +68,9 @@ class AlarmMemory(msgspec.Struct, frozen=True):
     attempt: int
     begun_ago_ns: tuple[int, ...]
     raised_ago_ns: tuple[int, ...]
+    key: str = ""
+    detail: dict[str, Any] = {}
+    text: str = ""
 
 
 class State(msgspec.Struct, frozen=True):
@@ -98,6 +111,8 @@ class Supervisor:
         self._out: list[Output] = []
         self._things = Things()
         self._alarms = {name: AlarmMachine(alarm, self, self.timers) for name, alarm in catalog.alarms.items()}
+        self._reported: dict[str, dict[str, AlarmMachine]] = {name: {} for name in catalog.alarms}
+        self._codes: dict[int, dict[str, TroubleCodeReport]] = {}
         self._raised: dict[str, deque[int]] = {name: deque() for name in catalog.alarms}
         self._counts: list[_Window] = []
         self._holds: dict[str, _Hold] = {}
@@ -171,12 +186,51 @@ class Supervisor:
 
     def state(self) -> State:
         """What to store for the next start."""
-        return State(self.mode, tuple(self._memory(alarm) for alarm in self._alarms.values()
+        return State(self.mode, tuple(self._memory(alarm) for alarm in self._machines()
                                       if alarm.state != NORMAL or self._raised[alarm.definition.name] or self._begun_of(alarm)))
 
     def alarm_states(self) -> dict[str, int]:
         """Present state of every alarm: 0 Normal, 1 Active, 2 Repairing, 3 LockedOut."""
-        return {name: alarm.state for name, alarm in self._alarms.items()}
+        return {name: self.bus_state(name) for name in self._alarms}
+
+    def bus_state(self, name: str) -> int:
+        """State of an alarm as the bus shows it: the worst of its reported causes."""
+        return max((machine.state for machine in self._reported[name].values()), default=self._alarms[name].state)
+
+    def report(self, t_ns: int, alarm: str, key: str, present: bool, detail: dict[str, Any], text: str) -> None:
+        """A subsystem reports that one cause of an alarm is there, or no more (trouble codes, emergencies, lost heartbeats).
+
+        key: names the cause among all of this alarm; detail: what events carry as values. Delays and latches are those of
+        the alarm's definition. Nothing happens when no definition of that name is loaded.
+        """
+        if alarm not in self._alarms:
+            return
+        machines = self._reported[alarm]
+        machine = machines.get(key)
+        if machine is None:
+            if not present:
+                return
+            if len(machines) >= MAX_INSTANCES:
+                self.counters[f"causes of {alarm} beyond the limit"] += 1
+                return
+            machine = machines[key] = self._instance(alarm, key, detail, text)
+        if present:
+            machine.detail = detail
+        zone = Zone.RAISE if present else Zone.CLEAR
+        if machine.zone != zone:
+            machine.zone_changed(t_ns, zone)
+        if machine.state == NORMAL and not present:
+            machines.pop(key, None)
+
+    def _instance(self, alarm: str, key: str, detail: dict[str, Any], text: str) -> AlarmMachine:
+        machine = AlarmMachine(self.catalog.alarms[alarm], self, self.timers)
+        machine.key, machine.detail, machine.text = key, detail, text
+        return machine
+
+    def _machines(self) -> Iterator[AlarmMachine]:
+        for name, machine in self._alarms.items():
+            yield machine
+            yield from list(self._reported[name].values())
 
     # --- time -------------------------------------------------------------------------------------------------------------
 
@@ -248,7 +302,37 @@ class Supervisor:
                 self._compile_repair(machine, alarm.repair, compiler)
         for (name, window_ns), cell in things.counts.items():
             self._counts.append(_Window(self, name, window_ns, cell))
+        if TROUBLE_CODE in self._alarms or things.codes:
+            transport = Transport(board.deliver, self.counters)
+            board.listen(TP_CM, transport.connection)
+            board.listen(TP_DT, transport.packet)
+            board.listen(DM1, self._diagnosed)
         board.compile()
+
+    def _diagnosed(self, t_ns: int, key: int, data: bytes) -> None:
+        """A DM1: trouble codes appear and vanish."""
+        diagnosis = parse_dm1(data)
+        if diagnosis is None:
+            self.counters["trouble code messages cut short"] += 1
+            return
+        source, bus = key & 0xFF, key >> BUS_SHIFT
+        sender = bus << 8 | source
+        before = self._codes.get(sender, {})
+        now = {f"{bus}/{source}/{code.spn}/{code.fmi}": code for code in diagnosis.codes}
+        for name in before.keys() - now.keys():
+            self.report(t_ns, TROUBLE_CODE, name, False, {}, "")
+        for name, code in now.items():
+            detail = {"SourceAddress": source, "SPN": code.spn, "FMI": code.fmi, "Occurrences": code.occurrences,
+                      "Lamps": " ".join(diagnosis.lamps), "Bus": bus}
+            text = f"SPN {code.spn} {FMI_WORDS[code.fmi]}, from source address {source}"
+            self.report(t_ns, TROUBLE_CODE, name, True, detail, text)
+        self._codes[sender] = now
+        active = {(code.spn, code.fmi) for codes in self._codes.values() for code in codes.values()}
+        for (spn, fmi), cell in self._things.codes.items():
+            k = int(any(one == spn and fmi in (None, two) for one, two in active))
+            if cell.k != k:
+                cell.k = k
+                self.board.queue(cell)
 
     def _expressions(self) -> Iterable[Expression]:
         for alarm in self.catalog.alarms.values():
@@ -338,7 +422,7 @@ class Supervisor:
         """Report a step upward, always."""
         self.seq += 1
         definition = alarm.definition
-        values = {name: read(t_ns) for name, read in self._inputs[definition.name]}
+        values = alarm.detail if alarm.key else {name: read(t_ns) for name, read in self._inputs[definition.name]}
         self._out.append(Event(
             self.unit, self.boot, self.seq, seconds(t_ns), self.utc(t_ns), self.utc_trusted, definition.name, definition.code,
             definition.priority, event, self.seq if event == "raised" else alarm.instance, attempt, values, text, frames, passive))
@@ -353,9 +437,11 @@ class Supervisor:
 
     def moved(self, alarm: AlarmMachine, t_ns: int) -> None:
         """The state of an alarm has changed: conditions that ask for it, and everyone on the bus, must know."""
+        if alarm.key and alarm.state == NORMAL:
+            self._reported[alarm.definition.name].pop(alarm.key, None)
         cell = self._things.alarms.get(alarm.definition.name)
         if cell is not None:
-            cell.k = alarm.state
+            cell.k = self.bus_state(alarm.definition.name)
             self.board.queue(cell)
         broadcast = self._broadcasts.get(alarm.definition.message)
         if broadcast is not None:
@@ -480,7 +566,7 @@ class Supervisor:
     def _people(self, order: Order) -> str:
         who = order.origin
         if order.name == "acknowledge" and not order.target:
-            for alarm in self._alarms.values():
+            for alarm in self._machines():
                 if alarm.state != NORMAL:
                     alarm.acknowledge(self.now_ns, who)
             return ""
@@ -488,7 +574,8 @@ class Supervisor:
         if machine is None:
             return f"unknown alarm {order.target}"
         if order.name == "acknowledge":
-            return machine.acknowledge(self.now_ns, who)
+            causes = list(self._reported[order.target].values())
+            return " ".join(dict.fromkeys(cause.acknowledge(self.now_ns, who) for cause in causes or [machine])).strip()
         repair = machine.definition.repair
         if order.origin == "above" and (repair is None or repair.local_reset):
             return f"{order.target} can only be reset at the machine"
@@ -528,7 +615,8 @@ class Supervisor:
         now = self.now_ns
         return AlarmMemory(name, alarm.state, alarm.instance, alarm.acknowledged, repair.attempt if repair is not None else 0,
                            tuple(now - begun for begun in self._begun_of(alarm)),
-                           tuple(now - raised for raised in self._raised[name]))
+                           tuple(now - raised for raised in self._raised[name]) if not alarm.key else (),
+                           alarm.key, alarm.detail, alarm.text if alarm.key else "")
 
     def _restore(self, state: State, now_ns: int) -> None:
         for memory in state.alarms:
@@ -536,6 +624,9 @@ class Supervisor:
             if machine is None:
                 self.counters["remembered alarms that are defined no more"] += 1
                 continue
+            if memory.key:
+                machine = self._instance(memory.name, memory.key, memory.detail, memory.text)
+                self._reported[memory.name][memory.key] = machine
             self._raised[memory.name].extend(now_ns - ago for ago in memory.raised_ago_ns)
             machine.state = memory.state
             machine.zone = Zone.STALE
@@ -608,12 +699,12 @@ class _Broadcast:
         self.message = message
         self.order = supervisor.timers.order()
         self.due = FAR
-        self.alarms = [alarm for alarm in supervisor._alarms.values() if alarm.definition.message == message.name]
+        self.alarms = [alarm.name for alarm in supervisor.catalog.alarms.values() if alarm.message == message.name]
 
     def expire(self, now_ns: int) -> None:
         """Send it as it is now."""
         supervisor = self.supervisor
-        payload = encode(self.message, {alarm.definition.name: alarm.state for alarm in self.alarms})
+        payload = encode(self.message, {name: supervisor.bus_state(name) for name in self.alarms})
         try:
             supervisor.send(now_ns, self.message.name, payload, "alarm states")
         except Refused:
