@@ -23,7 +23,7 @@ UNITS_NS = {"us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "min": 60_000_000_
 SCHEMES = ("mqtt", "mqtts")
 SHORTEST_PERIOD_NS, LONGEST_PERIOD_NS = 10_000_000, 60_000_000_000
 _DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)")
-_TOPIC_LEVEL = re.compile(r"[^\s/+#$][^\s/+#]*")
+_TOPIC_LEVEL = re.compile(r"[^\s/+#$\x00-\x1f\x7f][^\s/+#\x00-\x1f\x7f]{0,63}")
 _KINDS = {str: "a text", int: "a whole number", bool: "true or false", float: "a number", dict: "a table"}
 
 
@@ -219,7 +219,7 @@ def _rule_problems(table: Mapping[str, Any]) -> Iterator[str]:
         name = unit.get(key)
         if isinstance(name, str) and not _TOPIC_LEVEL.fullmatch(name):
             yield (f'unit.{key}: "{name}" can\'t stand in an MQTT topic; '
-                   'leave out spaces, "/", "+", "#" and a "$" at the start')
+                   'leave out spaces, "/", "+", "#" and a "$" at the start, and take at most 64 letters')
     yield from _bus_problems(table.get("bus"))
     broker = bridge.get("broker")
     if isinstance(broker, str) and (problem := _broker_problem(broker)):

@@ -89,7 +89,8 @@ def test_paths_count_from_the_folder_of_the_file(tmp_path: Path) -> None:
      'bridge.period: "250" is no duration; write a number and a unit (us, ms, s, min, h), such as "250 ms"'),
     ('"250 ms"', '"1 h"', 'bridge.period: "1 h" is outside 10 ms to 1 min'),
     ('name = "tractor-7"', 'name = "tractor 7"',
-     'unit.name: "tractor 7" can\'t stand in an MQTT topic; leave out spaces, "/", "+", "#" and a "$" at the start'),
+     'unit.name: "tractor 7" can\'t stand in an MQTT topic; '
+     'leave out spaces, "/", "+", "#" and a "$" at the start, and take at most 64 letters'),
     ("mqtts://level2.local:8883", "level2.local",
      'bridge.broker: "level2.local" is no MQTT address; write "mqtt://host:1883" or "mqtts://host:8883"'),
     ("mqtts://level2.local:8883", "mqtt://host:99999999",

@@ -1,0 +1,173 @@
+"""The live loop: the one thread that owns the supervisor of a unit.
+
+It waits for frames, orders or the next deadline; hands frames over in batches, in the order of their stamps; and brings what
+comes out to where it belongs: **events into the journal first, on the disk**, then frames to the buses, then results and
+monitoring messages to the link upward. Time is the monotonic clock; UTC is a label, measured anew at every turn, because
+the wall clock of a tractor jumps.
+"""
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import msgspec
+
+from level1.event import Event, Monitor, Output, Result, Send
+from level1.frame import BUS_SHIFT, Frame
+from level1.io.can import Port
+from level1.io.inbox import Inbox
+from level1.supervisor import State, Supervisor
+
+LAG_NS = 2_000_000
+"""Deadlines are served so late, that a frame stamped before one, which its reader hands over a moment later, still counts."""
+LONGEST_WAIT_S = 1.0
+TRUST_PERIOD_NS = 10_000_000_000
+_TIME_ERROR = 5
+
+
+class EventStore(Protocol):
+    """What the loop needs of `level1.io.journal.Journal`."""
+
+    def append(self, events: Sequence[Event], state: bytes) -> bool:
+        """Write events and the state after them; True when they are on the disk."""
+
+    @property
+    def fault(self) -> str | None:
+        """Why events are not on the disk."""
+
+    @property
+    def incidents(self) -> tuple[str, ...]:
+        """What befell the journal's file so far."""
+
+
+class Link(Protocol):
+    """The way to the bridge process; never blocks."""
+
+    def publish(self, outputs: Sequence[Monitor | Result]) -> None:
+        """Pass on monitoring messages and answers; what can't be passed on is dropped."""
+
+
+class Live:
+    """Drives a supervisor from an inbox and ports until `stop`.
+
+    supervisor: of this boot, not yet given anything. ports: in the order of the bus indexes, started and stopped by the
+    caller. told: called with every event once it is in the journal. notice: called with a line about the world (a bus lost,
+    the journal's disk full). clock, wall: monotonic and wall clock in ns. dropped: frames that came faster than they were
+    supervised.
+    """
+
+    def __init__(self, supervisor: Supervisor, journal: EventStore, ports: Sequence[Port], inbox: Inbox, *,
+                 clock: Callable[[], int], wall: Callable[[], int], told: Callable[[Event], None],
+                 notice: Callable[[str], None], link: Link | None = None):
+        self.supervisor, self.journal, self.ports, self.inbox = supervisor, journal, ports, inbox
+        self.dropped = 0
+        self._clock, self._wall, self._told, self._notice, self._link = clock, wall, told, notice, link
+        self._stopping = False
+        self._served_ns = clock()
+        self._retry_ns: int | None = None
+        self._trust_due_ns = 0
+        self._fault: str | None = None
+        self._incidents = 0
+
+    def stop(self) -> None:
+        """End `run` soon; may be called from a signal handler."""
+        self._stopping = True
+        self.inbox.wake()
+
+    def run(self) -> None:
+        """Supervise until `stop`; then store the state."""
+        try:
+            while not self._stopping:
+                self.turn(self.patience_s())
+        finally:
+            self.journal.append((), encode_state(self.supervisor.state()))
+
+    def turn(self, patience_s: float) -> None:
+        """Wait at most so long for something to do, and do all there is."""
+        self.inbox.wait(patience_s)
+        load = self.inbox.take()
+        now_ns = self._clock()
+        self._label(now_ns)
+        for text in load.notices:
+            self._notice(text)
+        if load.dropped:
+            self.dropped += load.dropped
+            self._notice(f"{load.dropped} frames dropped, the oldest first: supervision can't keep up")
+        outputs = self._feed(load.frames)
+        self._served_ns = max(self._served_ns, now_ns - LAG_NS, self.supervisor.now_ns)
+        for order in load.orders:
+            outputs.extend(self.supervisor.command(order, self._served_ns))
+        deadline = self.supervisor.next_deadline()
+        if deadline is not None and deadline <= self._served_ns:
+            outputs.extend(self.supervisor.tick(self._served_ns))
+        self._deliver(outputs)
+
+    def _feed(self, frames: list[Frame]) -> list[Output]:
+        """Frames of several buses, in the order of their stamps."""
+        if not frames:
+            return []
+        frames.sort(key=_stamp)
+        return self.supervisor.receive_many(frames)
+
+    def _deliver(self, outputs: Sequence[Output]) -> None:
+        """Durable first; then to the buses; then upward."""
+        events = [output for output in outputs if isinstance(output, Event)]
+        upward = [output for output in outputs if isinstance(output, Monitor | Result)]
+        if events or any(isinstance(output, Result) for output in upward):
+            self.journal.append(events, encode_state(self.supervisor.state()))
+        now_ns = self._clock()
+        for output in outputs:
+            if isinstance(output, Send):
+                self.ports[output.key >> BUS_SHIFT].send(output, now_ns)
+        retries = [retry for port in self.ports if (retry := port.flush(now_ns)) is not None]
+        self._retry_ns = min(retries, default=None)
+        if upward and self._link is not None:
+            self._link.publish(upward)
+        for event in events:
+            self._told(event)
+        self._tell_journal()
+
+    def _tell_journal(self) -> None:
+        for incident in self.journal.incidents[self._incidents:]:
+            self._notice(incident)
+            self._incidents += 1
+        fault = self.journal.fault
+        if fault != self._fault:
+            self._notice(fault or "the journal works again; nothing waits in memory")
+            self._fault = fault
+
+    def patience_s(self) -> float:
+        """How long nothing has to be done, unless something comes."""
+        deadline = self.supervisor.next_deadline()
+        dues = [due for due in (deadline + LAG_NS if deadline is not None else None, self._retry_ns) if due is not None]
+        wait_s = (min(dues) - self._clock()) / 1e9 if dues else LONGEST_WAIT_S
+        return min(max(wait_s, 0.0), LONGEST_WAIT_S)
+
+    def _label(self, now_ns: int) -> None:
+        """UTC beside the time line, and whether it is to be trusted."""
+        self.supervisor.utc_offset_ns = self._wall() - now_ns
+        if now_ns >= self._trust_due_ns:
+            self._trust_due_ns = now_ns + TRUST_PERIOD_NS
+            self.supervisor.utc_trusted = clock_is_synchronised()
+
+
+def encode_state(state: State) -> bytes:
+    """The supervisor's state as the journal keeps it."""
+    return msgspec.json.encode(state)
+
+
+def decode_state(stored: bytes) -> State:
+    """The state the journal kept. Raises msgspec.DecodeError when another version of this program wrote it."""
+    return msgspec.json.decode(stored, type=State)
+
+
+def clock_is_synchronised() -> bool:
+    """Whether the kernel says that something (NTP, GNSS) keeps the wall clock right (adjtimex(2))."""
+    buffer = ctypes.create_string_buffer(512)
+    state: int = ctypes.CDLL(None).adjtimex(buffer)
+    return 0 <= state < _TIME_ERROR
+
+
+def _stamp(frame: Frame) -> int:
+    return frame.t_ns

@@ -1,0 +1,126 @@
+"""`ucs run`: supervises a unit live, until SIGTERM or Ctrl-C."""
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from level1.catalog import Catalog
+from level1.event import Event
+from level1.io import config, definitions
+from level1.io.can import Port
+from level1.io.config import Config
+from level1.io.error import OutsideError
+from level1.io.inbox import Inbox
+from level1.io.journal import Journal
+from level1.io.live import Live, decode_state
+from level1.supervisor import State, Supervisor
+from ucs.render import clock, event_line, painted, wants_colour
+
+
+def add_parser(commands: Any) -> None:
+    """The arguments of `ucs run`."""
+    parser: ArgumentParser = commands.add_parser(
+        "run", help="supervise a unit live",
+        description="Supervise a unit live: read its buses, raise alarms, repair what is armed, write the journal. A line for "
+                    "each event as it happens. Ends by SIGTERM or Ctrl-C with exit code 0.")
+    parser.add_argument("unit", metavar="unit.toml", help="the unit's configuration")
+    parser.add_argument("--check", action="store_true", help="only check the configuration and its definitions")
+
+
+def run(args: Namespace) -> int:
+    """Supervise, or only check."""
+    settings = config.load(args.unit)
+    catalog = definitions.load((), settings.bus_files)
+    config.check_armed(settings, catalog)
+    if args.check:
+        print(*_start_lines(settings, catalog), f"{settings.path}: good", sep="\n")
+        return 0
+    if settings.journal is None:
+        raise config.ConfigError(f'{settings.path}: journal: missing; add [journal] with path = "journal.db"')
+    with ExitStack() as stack:
+        inbox = Inbox()
+        ports = [Port(index, bus, inbox, time.monotonic_ns, time.time_ns) for index, bus in enumerate(settings.bus)]
+        for port in ports:
+            port.start()
+            stack.callback(port.stop)
+        journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name))
+        live = Live(_supervisor(settings, catalog, journal), journal, ports, inbox, clock=time.monotonic_ns,
+                    wall=time.time_ns, told=_told, notice=_notice)
+        with _ended_by_signals(live):
+            print(*_start_lines(settings, catalog), f"boot {journal.boot}, journal {settings.journal.path}; supervising",
+                  sep="\n", flush=True)
+            live.run()
+    print(*_end_lines(live, ports), sep="\n", flush=True)
+    return 0
+
+
+def _supervisor(settings: Config, catalog: Catalog, journal: Journal) -> Supervisor:
+    """The supervisor of this boot, with the latches and budgets of the last one."""
+    return Supervisor(catalog, unit=settings.unit.name, boot=journal.boot, armed=settings.repairs.armed,
+                      start_ns=time.monotonic_ns(), restored=_restored(journal),
+                      monitor_ns=settings.bridge.period_ns if settings.bridge else None)
+
+
+def _restored(journal: Journal) -> State | None:
+    stored = journal.restored_state()
+    if stored is None:
+        return None
+    try:
+        return decode_state(stored)
+    except msgspec.DecodeError as error:
+        raise OutsideError(f"journal {journal.path}: its latches and lock-outs can't be read ({error}); see to what was locked "
+                           "out, then set another [journal] path") from None
+
+
+def _told(event: Event) -> None:
+    """A line for an event; someone may be reading a pipe."""
+    print(event_line(event, clock(event), wants_colour(sys.stdout)), flush=True)
+
+
+def _notice(text: str) -> None:
+    print(f"ucs: {text}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _ended_by_signals(live: Live) -> Iterator[None]:
+    """Within it SIGTERM and Ctrl-C stop the loop instead of the process."""
+    before = {number: signal.signal(number, lambda *_: live.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _start_lines(settings: Config, catalog: Catalog) -> Iterator[str]:
+    """What is loaded, which repairs may act, on which buses."""
+    yield painted(f"{settings.unit.name} of {settings.unit.fleet}", "1", wants_colour(sys.stdout))
+    for bus in settings.bus:
+        files = ", ".join(Path(name).name for name in bus.dbc) or "no definitions"
+        yield f"  bus {bus.name}: {bus.interface} {bus.channel} ({files})"
+    repairable = [name for name, alarm in catalog.alarms.items() if alarm.repair]
+    armed = [name for name in repairable if name in settings.repairs.armed]
+    passive = [name for name in repairable if name not in settings.repairs.armed]
+    yield f"  {len(catalog.alarms)} alarms; repairs armed: {', '.join(armed) or 'none'}; passive: {', '.join(passive) or 'none'}"
+    if settings.gnss:
+        yield f"  gnss {settings.gnss.port}: not read by this version"
+
+
+def _end_lines(live: Live, ports: list[Port]) -> Iterator[str]:
+    """What became of the frames."""
+    yield "stopped; the journal is closed"
+    for port in ports:
+        counts = ", ".join(f"{count} {word}" for word, count in sorted(port.counters.items()))
+        yield f"  bus {port.settings.name}: {counts or 'no frame sent'}"
+    for word, count in sorted(live.supervisor.counters.items()):
+        yield f"  {count} {word}"
+    if live.dropped:
+        yield f"  {live.dropped} frames dropped"

@@ -1,0 +1,121 @@
+"""`ucs run`: starts with what it has loaded, tells each event as it happens, stops cleanly; every obstacle is one line."""
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from level1.decode import encode
+from level1.io.definitions import load
+from level1.io.journal import read_events
+from ucs.main import main
+
+UNIT = """
+[unit]
+name = "tractor-7"
+[[bus]]
+name = "implement"
+interface = "virtual"
+channel = "test_run"
+dbc = ["flaming_tool.dbc"]
+[repairs]
+armed = ["PilotFlameOut"]
+[journal]
+path = "journal.db"
+"""
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    file = tmp_path / "unit.toml"
+    file.write_text(UNIT)
+    return file
+
+
+@pytest.fixture
+def tool() -> Iterator[Callable[[Callable[[can.Message], bool]], None]]:
+    """Starts a flaming tool whose pilot flame is out, on the virtual bus; ends this process's `ucs run` by SIGTERM when the
+    function, called with every message the tool hears, says so."""
+    message = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
+    payload = encode(message, {"Flaming": 1, "PilotFlame": 0, "Safeguard": 4}, None)
+    ended = threading.Event()
+    threads = []
+
+    def start(enough: Callable[[can.Message], bool]) -> None:
+        def live() -> None:
+            with can.Bus("test_run", interface="virtual") as bus:
+                stop = time.monotonic() + 20
+                while not ended.is_set() and time.monotonic() < stop:
+                    bus.send(can.Message(arbitration_id=0x210, is_extended_id=False, data=payload))
+                    heard = bus.recv(0.05)
+                    if heard and enough(heard):
+                        os.kill(os.getpid(), signal.SIGTERM)
+                        return
+
+        threads.append(threading.Thread(target=live))
+        threads[-1].start()
+
+    yield start
+    ended.set()
+    for thread in threads:
+        thread.join()
+
+
+def test_an_alarm_is_told_repaired_stored_and_broadcast(
+        unit: Path, tool: Callable[[Callable[[can.Message], bool]], None], capsys: pytest.CaptureFixture[str]) -> None:
+    heard: list[tuple[int, bytes]] = []
+
+    def enough(message: can.Message) -> bool:
+        heard.append((message.arbitration_id, bytes(message.data)))
+        return any(can_id == 0x110 for can_id, _ in heard) and any(can_id == 0x650 and data[0] & 3 == 2 for can_id, data in heard)
+
+    tool(enough)
+    assert main(["run", str(unit)]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out[0] == "tractor-7 of fleet"
+    assert out[1] == "  bus implement: virtual test_run (flaming_tool.dbc)"
+    assert out[2].startswith("  13 alarms; repairs armed: PilotFlameOut; passive: FlamingStartStopFailure, ")
+    assert out[3] == f"boot 1, journal {unit.parent / 'journal.db'}; supervising"
+    assert out[4].endswith("Z  PilotFlameOut                raised         high: Flaming On, PilotFlame Off")
+    assert "attempt 1, sends FLAMER_CMD" in out[5]
+    assert "stopped; the journal is closed" in out
+    stored = read_events(unit.parent / "journal.db")
+    assert [(event.unit, event.boot, event.seq, event.event) for event in stored][:2] == [
+        ("tractor-7", 1, 1, "raised"), ("tractor-7", 1, 2, "repair_started")]
+
+
+def test_ctrl_c_ends_it_with_0_and_the_next_start_is_a_new_boot(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for boot in (1, 2):
+        threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+        assert main(["run", str(unit)]) == 0
+        assert f"boot {boot}, journal" in capsys.readouterr().out
+
+
+def test_check_only_looks(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", str(unit), "--check"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"{unit}: good"
+    assert not (unit.parent / "journal.db").exists()
+
+
+@pytest.mark.parametrize(("old", "new", "code", "error"), [
+    ('["PilotFlameOut"]', '["PilotFlameOot"]', 2,
+     'repairs.armed[0]: no alarm is called "PilotFlameOot"; did you mean "PilotFlameOut"?'),
+    ('"virtual"', '"virtuell"', 2, 'bus implement: no interface is called "virtuell"; did you mean "virtual"?'),
+    ("[journal]\npath", "[journal]\npaht", 2, 'journal.paht: unknown key; did you mean "path"?'),
+    ('[journal]\npath = "journal.db"', "", 2, 'journal: missing; add [journal] with path = "journal.db"'),
+    ('"journal.db"', '"/proc/nowhere/journal.db"', 2, "journal /proc/nowhere/journal.db: "),
+    ('"flaming_tool.dbc"', '"flaming_tol.dbc"', 1, "flaming_tol.dbc: error: no such file"),
+])
+def test_every_obstacle_is_one_line(
+        unit: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, code: int, error: str) -> None:
+    assert old in UNIT
+    unit.write_text(UNIT.replace(old, new))
+    assert main(["run", str(unit)]) == code
+    captured = capsys.readouterr()
+    assert error in captured.err.splitlines()[0] and "Traceback" not in captured.err and captured.out == ""
