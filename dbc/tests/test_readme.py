@@ -222,7 +222,7 @@ def test_the_reference_names_every_attribute() -> None:
 
 def test_the_reference_names_every_function() -> None:
     named = set(re.findall(r"`(\w+)\(", reference("Functions")))
-    assert named == set(resolver.FUNCTIONS)
+    assert named == set(resolver.FUNCTIONS), "the table of functions in README.md and resolver.FUNCTIONS differ"
 
 
 def test_the_reference_names_every_event() -> None:
