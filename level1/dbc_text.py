@@ -17,34 +17,41 @@ EXTENDED_ID = 0x8000_0000
 UNUSED_MESSAGE = "VECTOR__INDEPENDENT_SIG_MSG"
 """Vector's name for the message that holds signals of no message; cantools leaves it out too."""
 
-_STRING = r'"[^"\\]*+(?:\\"?[^"\\]*+)*+"'
-_NUMBER = r"[-+]?\d{1,400}\.?\d{0,400}(?:[eE][-+]?\d{1,4})?(?![\w.])"
+STRING = r'"[^"\\]*+(?:\\"?[^"\\]*+)*+(?:"|\Z)'
+"""A string as cantools reads it: `\\"` is a quote inside. Possessive, so that no text makes it look twice; one without end
+reaches to the end of the file."""
+_NUMBER = r"[-+]?\d{1,400}\.?\d{0,400}(?:[eE][-+]?\d{1,3})?(?![\w.])"
 _INT = r"\d{1,12}"
 _OBJECT = r"(?:(?P<kind>SG_|BO_|BU_|EV_)\s+(?P<object>\w+)(?:\s+(?P<signal>[A-Za-z_]\w*))?\s*)?"
 
 _HEAD = re.compile(
-    rf"{_STRING}|\b(?P<word>BO_|SG_|BA_|BA_DEF_|BA_DEF_DEF_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_)(?=\s)", re.DOTALL)
+    rf"{STRING}|\b(?P<word>BO_|SG_|BA_|BA_DEF_|BA_DEF_DEF_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_)(?=\s)", re.DOTALL)
 _BODIES: Mapping[str, re.Pattern[str]] = {
     "BO_": re.compile(rf"BO_\s+(?P<id>{_INT})\s+(?P<name>\w+)\s*:\s*(?P<length>{_INT})\s+(?P<sender>\w+)"),
     "SG_": re.compile(
         rf"SG_\s+(?P<name>\w+)(?:\s+(?P<mux>\w+))?\s*:\s*(?P<start>{_INT})\s*\|\s*(?P<length>{_INT})\s*@\s*(?P<order>[01])"
         rf"\s*(?P<sign>[-+])\s*\(\s*(?P<factor>{_NUMBER})\s*,\s*(?P<offset>{_NUMBER})\s*\)"
         rf"\s*\[\s*(?P<minimum>{_NUMBER})\s*\|\s*(?P<maximum>{_NUMBER})\s*\]"),
-    "BA_": re.compile(rf'BA_\s+"(?P<name>[^"]*)"\s*{_OBJECT}(?P<value>{_STRING}|{_NUMBER})\s*;', re.DOTALL),
+    "BA_": re.compile(rf'BA_\s+"(?P<name>[^"]*)"\s*{_OBJECT}(?P<value>{STRING}|{_NUMBER})\s*;', re.DOTALL),
     "BA_DEF_": re.compile(
-        r'BA_DEF_\s+(?:(?P<kind>SG_|BO_|BU_|EV_)\s+)?"(?P<name>[^"]*)"\s*(?P<type>\w+)(?P<rest>[^;]*);'),
-    "BA_DEF_DEF_": re.compile(rf'BA_DEF_DEF_\s+"(?P<name>[^"]*)"\s*(?P<value>{_STRING}|{_NUMBER})\s*;', re.DOTALL),
-    "VAL_": re.compile(rf"VAL_\s+(?P<id>{_INT})\s+(?P<name>\w+)(?P<rest>(?:\s*{_NUMBER}\s*{_STRING})*+)\s*;", re.DOTALL),
+        r'BA_DEF_\s+(?:(?P<kind>SG_|BO_|BU_|EV_)\s+)?"(?P<name>[^"]*)"\s*(?P<type>\w+)'),
+    "BA_DEF_DEF_": re.compile(rf'BA_DEF_DEF_\s+"(?P<name>[^"]*)"\s*(?P<value>{STRING}|{_NUMBER})\s*;', re.DOTALL),
+    "VAL_": re.compile(rf"VAL_\s+(?P<id>{_INT})\s+(?P<name>\w+)(?P<rest>(?:\s*{_NUMBER}\s*{STRING})*+)\s*;", re.DOTALL),
     "SIG_VALTYPE_": re.compile(rf"SIG_VALTYPE_\s+(?P<id>{_INT})\s+(?P<name>\w+)\s*:\s*(?P<type>{_INT})\s*;"),
     "SG_MUL_VAL_": re.compile(
         rf"SG_MUL_VAL_\s+(?P<id>{_INT})\s+(?P<name>\w+)\s+(?P<multiplexer>\w+)\s+(?P<ranges>{_INT}\s*-\s*{_INT}(?:\s*,\s*{_INT}\s*-\s*{_INT})*+)\s*;"),
 }
 _MALFORMED: Mapping[str, re.Pattern[str]] = {
-    "BO_": re.compile(r'BO_\s[^:;"]*:'),
-    "SG_": re.compile(r'SG_\s[^:;"]*:'),
-    "SG_MUL_VAL_": re.compile(r'SG_MUL_VAL_\s+\d[^;]*;?'),
+    "BO_": re.compile(r"BO_\s++[\w.+-]++\s*+\w*+\s*+:"),
+    "SG_": re.compile(r"SG_\s++\w++\s*+\w*+\s*+:"),
+    "SG_MUL_VAL_": re.compile(r"SG_MUL_VAL_\s++\d++[^;\n]{0,40}+"),
 }
 """What is meant as such a statement although it can't be read: cantools must not see what the index has not measured."""
+
+_KEYWORDS = frozenset("""
+    NS_ NS_DESC_ CM_ BA_DEF_ BA_ VAL_ CAT_DEF_ CAT_ FILTER BA_DEF_DEF_ EV_DATA_ ENVVAR_DATA_ SGTYPE_ SGTYPE_VAL_ BA_DEF_SGTYPE_
+    BA_SGTYPE_ SIG_TYPE_REF_ VAL_TABLE_ SIG_GROUP_ SIG_VALTYPE_ SIGTYPE_VALTYPE_ BO_TX_BU_ BA_DEF_REL_ BA_REL_
+    BA_DEF_DEF_REL_ BU_SG_REL_ BU_EV_REL_ BU_BO_REL_ SG_MUL_VAL_ BS_ BU_ BO_ SG_ EV_ VERSION""".split())
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +190,7 @@ def _ranges(text: str) -> tuple[tuple[int, int], ...]:
 def _without_comments(text: str) -> str:
     if "//" not in text:
         return text
-    return re.sub(rf"{_STRING}|//[^\n]*", lambda m: m[0] if m[0][0] == '"' else " " * len(m[0]), text, flags=re.DOTALL)
+    return re.sub(rf"{STRING}|//[^\n]*", lambda m: m[0] if m[0][0] == '"' else " " * len(m[0]), text, flags=re.DOTALL)
 
 
 def _statements(text: str) -> Iterator[tuple[str, re.Match[str]]]:
@@ -196,7 +203,7 @@ def _statements(text: str) -> Iterator[tuple[str, re.Match[str]]]:
         match = _BODIES[word].match(text, head.start())
         if match is None and word in _MALFORMED:
             match = _MALFORMED[word].match(text, head.start())
-            if match and all(part.endswith(("_", ":")) for part in match.group().split()):
+            if match and _KEYWORDS.issuperset(re.findall(r"\w+", match.group())):
                 continue  # the list of keywords behind NS_
         if match:
             position = match.end()

@@ -6,6 +6,7 @@ one, which reads the attributes of DESIGN §3 and puts the catalog together.
 """
 from __future__ import annotations
 
+import codecs
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -30,6 +31,8 @@ ALARM_BITS = 2
 """Bits an alarm's signal needs for its four states (DESIGN §3)."""
 OWN_COMMANDS = ("acknowledge", "reset")
 """Commands the core itself answers; a DBC can't define them."""
+MAX_FINDINGS = 10
+"""Mistakes told of one text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +104,9 @@ def build(sources: Sequence[Source],
 
 
 def decode(data: bytes) -> str:
-    """The text of a file: UTF-8, else cp1252, which Vector's tools write; no byte makes it fail."""
+    """The text of a file: UTF-8, else cp1252, which Vector's tools write, or UTF-16 where it says so; no byte makes it fail."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", errors="replace")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -154,10 +159,13 @@ class _Place:
         where = ".".join(part for part in self.owner if part)
         self._problems.append(Problem(self._file.path, line, where, attribute, column, severity, message, hint, text))
 
-    def take(self, attribute: str, text: str, findings: Iterable[Finding]) -> None:
-        """Adds what was found in an attribute's text."""
-        for finding in findings:
+    def take(self, attribute: str, text: str, findings: Sequence[Finding]) -> None:
+        """Adds what was found in an attribute's text, errors first where there is too much."""
+        found = list(findings)
+        for finding in sorted(found, key=lambda f: f.severity)[:MAX_FINDINGS]:
             self.note(attribute, finding.message, finding.hint, finding.severity, finding.column, text)
+        if len(found) > MAX_FINDINGS:
+            self.note(attribute, f"and {len(found) - MAX_FINDINGS} more", "put these right first", found[-1].severity)
 
     def text(self, name: str) -> str:
         """A STRING attribute on one line, "" when it isn't set."""

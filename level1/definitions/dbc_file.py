@@ -22,6 +22,7 @@ from level1 import dbc_text, similar
 from level1.catalog import Message, Problem, Signal
 from level1.dbc_text import EXTENDED_ID, UNUSED_MESSAGE, DbcText, EntryText, MessageText, SignalText
 from level1.decode import raw_range
+from level1.definitions import limits
 from level1.frame import j1939_pgn
 from level1.scaling import FLOAT_LENGTHS, float_bits
 
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
 
 ANY_SOURCE = 0xFE
 """Source address in a J1939 identifier that stands for any (J1939-81: the null address; DESIGN §3)."""
+MAX_VIOLATIONS = 20
+"""Exceeded limits told of one file; a hostile one may have thousands."""
+
 Owner = tuple[str, str]
 """Message name and signal name ("" for the message itself): whose attribute it is."""
 
@@ -73,6 +77,10 @@ class _Reader:
         self._blanked: list[tuple[int, int]] = []
 
     def read(self) -> DbcFile:
+        if oversize := list(limits.violations(self._text)):
+            for violation in oversize[:MAX_VIOLATIONS]:
+                self._problem(violation.line, violation.message, violation.hint)
+            return DbcFile(self._path, self._text, (), {}, tuple(self._problems), {})
         self._find_malformed()
         self._find_duplicates()
         self._find_undefined_attributes()

@@ -24,10 +24,11 @@ CPU_BASE_S, CPU_BYTES_PER_S = 8, 100_000
 """Seconds of computing time of the child: a base, and one more for so many bytes. An honest file takes a fifth of that."""
 WALL_FACTOR = 6
 """The child may take so many times longer on a busy machine before it is given up."""
-MAX_FILE_BYTES = 32_000_000
+MAX_FILE_BYTES = 16_000_000
 """Size of a file above which it isn't even read; 100,000 lines take 8 MB."""
 
 _OUT_OF_MEMORY = 3
+_AT = "at "
 
 
 class _Request(msgspec.Struct, frozen=True):
@@ -138,9 +139,11 @@ def _ask(request: _Request) -> Examination:
 
 def _failed(progress: bytes, reason: str) -> Examination:
     """The answer for a child that didn't come back; `progress`: what it wrote, the file at hand in the last such line."""
-    lines = [line for line in progress.decode("utf-8", "replace").splitlines() if line.startswith("reading ")]
-    file = lines[-1].removeprefix("reading ") if lines else "ucs"
-    return Examination(None, (Problem(file, 0, "", "", 0, "error", reason, "it is hostile or broken: don't use it"),))
+    lines = progress.decode("utf-8", "replace").splitlines()
+    files = [line.removeprefix(_AT) for line in lines if line.startswith(_AT)]
+    last = f": {lines[-1]}" if lines and not lines[-1].startswith(_AT) else ""
+    return Examination(None, (Problem(files[-1] if files else "ucs", 0, "", "", 0, "error", f"{reason}{last}",
+                                      "it is hostile or broken: don't use it"),))
 
 
 def _cpu_limit_s(paths: Iterable[str]) -> int:
@@ -152,7 +155,7 @@ def _work(request: _Request) -> Examination:
     files = []
     problems: list[Problem] = []
     for label, path in request.files:
-        print(f"reading {label}", file=sys.stderr, flush=True)
+        print(f"{_AT}{label}", file=sys.stderr, flush=True)
         size = os.path.getsize(path)
         if size > MAX_FILE_BYTES:
             problems.append(Problem(label, 0, "", "", 0, "error", f"has {size} bytes: too large for a DBC file",
