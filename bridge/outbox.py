@@ -230,7 +230,8 @@ class Outbox:
         found: list[Event] = []
         while len(found) < count:
             boot, seq = after
-            after = (boot, self._delivered.of(boot).end_of(seq + 1) if seq + 1 in self._delivered.of(boot) else seq)
+            if seq + 1 in self._delivered.of(boot):
+                after = (boot, self._delivered.of(boot).around(seq + 1)[1])
             events = self._journal.events(after, count)
             found += [event for event in events if event.seq not in self._delivered.of(event.boot)]
             if len(events) < count:

@@ -62,10 +62,12 @@ class Ranges:
         """How many numbers."""
         return sum(self._lasts) - sum(self._firsts) + len(self._firsts)
 
-    def end_of(self, number: int) -> int:
-        """The last number of the range that holds this one; the number itself when none does."""
+    def around(self, number: int) -> Range:
+        """The range that holds a number; the number alone when none does."""
         index = bisect_left(self._lasts, number)
-        return self._lasts[index] if index < len(self._firsts) and self._firsts[index] <= number else number
+        if index < len(self._firsts) and self._firsts[index] <= number:
+            return self._firsts[index], self._lasts[index]
+        return number, number
 
     @property
     def upto(self) -> int:

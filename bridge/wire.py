@@ -205,11 +205,6 @@ def topic(fleet: str, unit: str, kind: str, message: str = "") -> str:
     return "/".join([*levels, check_name(message, "monitoring message")] if kind == "monitor" else levels)
 
 
-def subscription(fleet: str, kind: str) -> str:
-    """The topic filter for one kind of message of a whole fleet."""
-    return "/".join([*PREFIX, check_name(fleet, "fleet"), "+", kind]) + ("/+" if kind == "monitor" else "")
-
-
 def parse_topic(text: str) -> Topic:
     """The parts of a topic. Raises WireError for one that is none of ours."""
     levels = text.split("/")

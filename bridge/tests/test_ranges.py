@@ -24,7 +24,8 @@ def test_ranges_are_sets_of_integers(ranges: list[tuple[int, int]], probe: tuple
     assert found.count() == len(expected)
     assert found.last == max(expected, default=0)
     assert set(range(1, found.upto + 1)) <= expected and found.upto + 1 not in expected
-    assert found.end_of(probe[0]) + 1 not in expected or probe[0] not in expected
+    first, last = found.around(probe[0])
+    assert first <= probe[0] <= last and (first - 1 not in expected and last + 1 not in expected or probe[0] not in expected)
 
 
 @given(st.lists(RANGE))

@@ -1,0 +1,225 @@
+"""The short way between `ucs run` and the bridge on the same machine: two datagram sockets beside the journal.
+
+Best effort by design: what must not be lost is in the journal, and neither process ever waits for the other. `ucs run`
+makes a `RunLink`, the bridge a `BridgeLink`; either may start first, end, and start again.
+
+    run → bridge   Poke       the journal has news (it is looked at every 50 ms anyhow)
+                   Samples    the latest monitoring messages; also the sign that supervision is alive
+                   Beside     events that the journal can't take now (`Journal.pending`): they leave all the same
+                   Answer     the result of an order
+    bridge → run   Instruct   an order that passed the gate
+"""
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Generic, Protocol, TypeVar
+
+import msgspec
+
+from level1.command import Order
+from level1.event import Event, Monitor, Result
+
+DATAGRAM_BYTES = 100_000
+"""A Unix datagram may have about 200 kB."""
+NEWEST = 200
+"""Events handed over beside the journal at a time."""
+RECEIVE = 100
+"""Datagrams taken in one call."""
+
+
+class Poke(msgspec.Struct, frozen=True, tag=True):
+    """The journal has news."""
+
+
+class Samples(msgspec.Struct, frozen=True, tag=True):
+    """The latest of each monitoring message."""
+
+    monitors: tuple[Monitor, ...] = ()
+
+
+class Beside(msgspec.Struct, frozen=True, tag=True):
+    """Events that are not in the journal."""
+
+    events: tuple[Event, ...]
+
+
+class Answer(msgspec.Struct, frozen=True, tag=True):
+    """The result of an order."""
+
+    result: Result
+
+
+class Instruct(msgspec.Struct, frozen=True, tag=True):
+    """An order from above that passed the gate."""
+
+    order: Order
+
+
+FromRun = Poke | Samples | Beside | Answer
+FromBridge = Instruct
+T = TypeVar("T")
+
+_encoder = msgspec.json.Encoder(decimal_format="number")
+
+
+class _End(Generic[T]):
+    """One end: receives at its own socket, sends to the other's, which may not be there."""
+
+    def __init__(self, journal: Path, own: str, other: str, decoder: msgspec.json.Decoder[T]):
+        self.malformed = 0
+        self._decoder = decoder
+        self._name, self._other = _name(journal, own), _name(journal, other)
+        # by the folder's descriptor: a socket's path has 107 bytes at most, a journal's has not
+        self._folder = os.open(journal.absolute().parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        try:
+            os.fchmod(self._socket.fileno(), 0o600)  # orders come this way
+            self._unlink()
+            self._socket.bind(self._path(self._name))
+        except BaseException:
+            self._socket.close()
+            os.close(self._folder)
+            raise
+
+    def fileno(self) -> int:
+        """Readable when something came."""
+        return self._socket.fileno()
+
+    def receive(self) -> list[T]:
+        """What came; malformed datagrams are counted and left out."""
+        found: list[T] = []
+        for _ in range(RECEIVE):
+            try:
+                datagram = self._socket.recv(DATAGRAM_BYTES + 1)
+            except OSError:
+                break
+            try:
+                found.append(self._decoder.decode(datagram))
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+                self.malformed += 1
+        return found
+
+    def close(self) -> None:
+        """Close the socket and remove it from the folder."""
+        self._unlink()
+        self._socket.close()
+        os.close(self._folder)
+
+    def _send(self, message: msgspec.Struct) -> bool:
+        """Whether the other end's socket took it."""
+        datagram = _encoder.encode(message)
+        if len(datagram) > DATAGRAM_BYTES:
+            return False
+        try:
+            self._socket.sendto(datagram, self._path(self._other))
+            return True
+        except OSError:
+            return False
+
+    def _path(self, name: str) -> str:
+        return f"/proc/self/fd/{self._folder}/{name}"
+
+    def _unlink(self) -> None:
+        try:
+            os.unlink(self._name, dir_fd=self._folder)
+        except OSError:
+            pass
+
+
+class RunLink(_End[FromBridge]):
+    """The end of `ucs run`. `receive` gives orders. Raises OSError where the folder can't be written."""
+
+    def __init__(self, journal: Path):
+        super().__init__(journal, "run", "bridge", msgspec.json.Decoder(FromBridge))
+
+    def poke(self) -> bool:
+        """Tell that the journal has news."""
+        return self._send(Poke())
+
+    def send_samples(self, *monitors: Monitor) -> bool:
+        """Hand over the latest monitoring messages; without any it still tells that supervision is alive."""
+        return self._send(Samples(monitors))
+
+    def send_beside(self, events: tuple[Event, ...]) -> bool:
+        """Hand over events that the journal can't take; to be repeated while it can't (best effort)."""
+        return all(self._send(Beside(events[first:first + 50])) for first in range(0, len(events), 50))
+
+    def answer(self, result: Result) -> bool:
+        """Hand over the result of an order."""
+        return self._send(Answer(result))
+
+    def publish(self, outputs: Sequence[Monitor | Result]) -> None:
+        """Hand over what the live loop gives upward; to be called at least once a second, with or without outputs."""
+        self.send_samples(*(output for output in outputs if isinstance(output, Monitor)))
+        for output in outputs:
+            if isinstance(output, Result):
+                self.answer(output)
+
+
+class Store(Protocol):
+    """What `LinkedJournal` needs of a journal."""
+
+    def append(self, events: Sequence[Event], state: bytes) -> bool:
+        """Write events and state; True when they are on the disk."""
+
+    @property
+    def fault(self) -> str | None:
+        """Why they are not."""
+
+    @property
+    def incidents(self) -> tuple[str, ...]:
+        """What befell the file."""
+
+    @property
+    def pending(self) -> tuple[Event, ...]:
+        """Events that are not on the disk."""
+
+
+class LinkedJournal:
+    """A journal whose news the bridge hears at once, and whose events leave by radio even while the disk takes nothing."""
+
+    def __init__(self, journal: Store, link: RunLink):
+        self._journal, self._link = journal, link
+
+    def append(self, events: Sequence[Event], state: bytes) -> bool:
+        """As the journal's; then the bridge is told."""
+        durable = self._journal.append(events, state)
+        if not durable:
+            self._link.send_beside(self._journal.pending[-NEWEST:])
+        elif events:
+            self._link.poke()
+        return durable
+
+    @property
+    def fault(self) -> str | None:
+        """The journal's."""
+        return self._journal.fault
+
+    @property
+    def incidents(self) -> tuple[str, ...]:
+        """The journal's."""
+        return self._journal.incidents
+
+    def publish(self, outputs: Sequence[Monitor | Result]) -> None:
+        """As `RunLink.publish`; what the disk doesn't take is handed over again, in case the bridge has just started."""
+        self._link.publish(outputs)
+        if pending := self._journal.pending:
+            self._link.send_beside(pending[-NEWEST:])
+
+
+class BridgeLink(_End[FromRun]):
+    """The bridge's end. Raises OSError where the folder can't be written."""
+
+    def __init__(self, journal: Path):
+        super().__init__(journal, "bridge", "run", msgspec.json.Decoder(FromRun))
+
+    def instruct(self, order: Order) -> bool:
+        """Hand over an order; False when `ucs run` isn't there, which the sender has to be told."""
+        return self._send(Instruct(order))
+
+
+def _name(journal: Path, end: str) -> str:
+    return f"{journal.name}.{end}.sock"

@@ -1,0 +1,114 @@
+"""The short way between `ucs run` and the bridge: neither waits for the other, neither minds the other's end."""
+from __future__ import annotations
+
+import os
+import socket
+import stat
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from bridge.link import Answer, Beside, BridgeLink, Instruct, LinkedJournal, Poke, RunLink, Samples
+from level1.command import Order
+from level1.event import Event, Monitor, Result, seconds
+
+MONITOR = Monitor("tractor-7", 1, seconds(5), None, False, "burners", {"a": 1}, {"a": 0.0}, {})
+ORDER = Order("c-1", "pause")
+EVENT = Event("tractor-7", 1, 1, seconds(1), None, False, "PilotFlameOut", 3101, "High", "raised", 1, 0, {}, "")
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Path:
+    return tmp_path / "journal.db"
+
+
+@pytest.fixture
+def ends(journal: Path) -> Iterator[tuple[RunLink, BridgeLink]]:
+    run, bridge = RunLink(journal), BridgeLink(journal)
+    yield run, bridge
+    run.close()
+    bridge.close()
+
+
+def test_messages_arrive_as_they_were_sent(ends: tuple[RunLink, BridgeLink]) -> None:
+    run, bridge = ends
+    assert run.poke() and run.send_samples(MONITOR) and run.send_beside((EVENT,)) and run.answer(Result("c-1", "done"))
+    assert bridge.receive() == [Poke(), Samples((MONITOR,)), Beside((EVENT,)), Answer(Result("c-1", "done"))]
+    assert bridge.instruct(ORDER)
+    assert run.receive() == [Instruct(ORDER)]
+    assert run.receive() == []
+
+
+def test_nobody_at_the_other_end_is_told_and_no_error(journal: Path) -> None:
+    run = RunLink(journal)
+    assert not run.poke()
+    run.close()
+    assert not journal.with_name("journal.db.run.sock").exists()
+
+
+def test_an_end_that_was_killed_is_replaced(journal: Path, ends: tuple[RunLink, BridgeLink]) -> None:
+    run, _ = ends
+    successor = BridgeLink(journal)
+    assert run.poke()
+    assert successor.receive() == [Poke()]
+    successor.close()
+
+
+def test_a_full_socket_does_not_hold_up_the_sender(ends: tuple[RunLink, BridgeLink]) -> None:
+    run, bridge = ends
+    taken = sum(run.poke() for _ in range(5000))
+    assert 0 < taken < 5000
+    while bridge.receive():
+        pass
+    assert run.poke()
+
+
+def test_malformed_datagrams_are_counted_and_left_out(journal: Path, ends: tuple[RunLink, BridgeLink]) -> None:
+    _, bridge = ends
+    stranger = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    here = os.getcwd()
+    os.chdir(journal.parent)
+    for datagram in (b"", b"{}", b"\xff", b'{"type":"Poke"', b'{"type":"Poke"}'):
+        stranger.sendto(datagram, "journal.db.bridge.sock")
+    os.chdir(here)
+    stranger.close()
+    assert bridge.receive() == [Poke()]
+    assert bridge.malformed == 4
+
+
+def test_a_long_path_is_no_obstacle(tmp_path: Path) -> None:
+    folder = tmp_path / ("x" * 120)
+    folder.mkdir()
+    run, bridge = RunLink(folder / "journal.db"), BridgeLink(folder / "journal.db")
+    assert run.poke()
+    run.close()
+    bridge.close()
+
+
+def test_only_the_owner_may_send_orders(journal: Path, ends: tuple[RunLink, BridgeLink]) -> None:
+    mode = journal.with_name("journal.db.run.sock").stat().st_mode
+    assert stat.S_IMODE(mode) == 0o600
+
+
+class FullDisk:
+    """A journal whose disk takes nothing."""
+
+    def __init__(self) -> None:
+        self.pending: tuple[Event, ...] = ()
+        self.fault: str | None = "full"
+        self.incidents = ("it was gone",)
+
+    def append(self, events: Sequence[Event], state: bytes) -> bool:
+        self.pending += tuple(events)
+        return False
+
+
+def test_what_the_disk_does_not_take_goes_beside_the_journal_again_and_again(ends: tuple[RunLink, BridgeLink]) -> None:
+    run, bridge = ends
+    journal = LinkedJournal(FullDisk(), run)
+    assert not journal.append((EVENT,), b"")
+    assert bridge.receive() == [Beside((EVENT,))]
+    journal.publish([MONITOR, Result("c-1", "done")])
+    assert bridge.receive() == [Samples((MONITOR,)), Answer(Result("c-1", "done")), Beside((EVENT,))]
+    assert (journal.fault, journal.incidents) == ("full", ("it was gone",))

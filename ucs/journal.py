@@ -1,0 +1,196 @@
+"""`ucs journal`: what happened on a unit: list, filter, follow, export."""
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from level1.event import EVENTS, Event, encode
+from level1.io.config import ConfigError, duration_ns, load
+from level1.io.error import OutsideError
+from level1.io.journal import FIRST, JournalError, Position, Reader
+
+POLL_S = 0.1
+CHUNK = 1000
+CSV_COLUMNS = ("unit", "boot", "seq", "t", "utc", "utc_trusted", "alarm", "code", "priority", "event", "instance", "attempt",
+               "passive", "text", "values", "frames")
+Writer = Callable[[Event], None]
+_encoder = msgspec.json.Encoder(decimal_format="number")
+DESCRIPTION = """\
+Lists the events in a unit's journal, oldest first: time, boot.seq, alarm, event, text. Reads only; `ucs run` may be running.
+"""
+EPILOG = """\
+Times are UTC labels (2025-05-01, 2025-05-01T10:30, …10:30:05Z), or "15 min" and the like before now.
+
+  ucs journal unit.toml --since "2 h" --alarm PilotFlameOut --values
+  ucs journal unit.toml --follow
+  ucs journal /media/card/journal.db --format csv > events.csv
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """The arguments of `ucs journal`."""
+    parser = subparsers.add_parser("journal", help="list and export what a unit's journal holds", description=DESCRIPTION,
+                                   epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("unit", metavar="unit.toml", type=Path, help="the unit's configuration, or a journal file (.db)")
+    parser.add_argument("--alarm", metavar="NAME", help="only this alarm")
+    parser.add_argument("--event", choices=EVENTS, help="only events of this kind")
+    parser.add_argument("--since", metavar="TIME", help="only events from this time on; events without UTC are left out")
+    parser.add_argument("--until", metavar="TIME", help="only events before this time")
+    parser.add_argument("--boot", metavar="N", type=int, help="only this boot of the unit")
+    parser.add_argument("--last", metavar="N", type=int, help="only the last N of them")
+    parser.add_argument("--values", action="store_true", help="show the freeze frame and the frames sent")
+    parser.add_argument("--follow", action="store_true", help="go on with new events as they come")
+    parser.add_argument("--format", choices=("text", "jsonl", "csv"), default="text", help="jsonl and csv for other programs")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print what was asked for. Raises OutsideError for what the user can put right."""
+    if args.last is not None and args.last < 1:
+        raise OutsideError(f"--last {args.last}: write a number from 1")
+    query = Query(args.alarm, args.event, _moment("--since", args.since), _moment("--until", args.until), args.boot)
+    write = {"text": _text_writer(args.values), "jsonl": _write_json, "csv": _csv_writer()}[args.format]
+    with Reader(_journal_path(args.unit)) as reader:
+        listing = Listing(reader, query)
+        found = listing.new()
+        count = 0
+        for event in found if args.last is None else deque(found, args.last):
+            write(event)
+            count += 1
+        if not count and not args.follow:
+            print("ucs journal: no event yet" if reader.last() == FIRST else "ucs journal: no such event", file=sys.stderr)
+        if args.follow:
+            _follow(reader, listing, write)
+    return 0
+
+
+class Query(NamedTuple):
+    """Which events; None: any. since and until compare with the UTC label."""
+
+    alarm: str | None = None
+    event: str | None = None
+    since: datetime | None = None
+    until: datetime | None = None
+    boot: int | None = None
+
+    def in_time(self, event: Event) -> bool:
+        """Whether the event is within the times asked for; one without UTC is not, when any is."""
+        if self.since is None and self.until is None:
+            return True
+        if event.utc is None:
+            return False
+        utc = _utc(event.utc)
+        return (self.since is None or utc >= self.since) and (self.until is None or utc < self.until)
+
+
+class Listing:
+    """Goes through a journal once, and on from there."""
+
+    def __init__(self, reader: Reader, query: Query):
+        self._reader, self._query = reader, query
+        self._after: Position = FIRST if query.boot is None else (query.boot, 0)
+        self._before: Position | None = None if query.boot is None else (query.boot + 1, 0)
+
+    def new(self) -> Iterator[Event]:
+        """The events asked for that were not given yet. Raises JournalError."""
+        end = self._reader.last()
+        while True:
+            events = self._reader.events(self._after, CHUNK, before=self._before, alarm=self._query.alarm, event=self._query.event)
+            for event in events:
+                self._after = (event.boot, event.seq)
+                if self._query.in_time(event):
+                    yield event
+            if len(events) < CHUNK:
+                break
+        self._after = max(self._after, end)
+
+
+def _follow(reader: Reader, listing: Listing, write: Writer) -> None:
+    """New events as they come, until Ctrl-C."""
+    try:
+        while True:
+            sys.stdout.flush()
+            time.sleep(POLL_S)
+            try:
+                news = list(listing.new()) if reader.changed() else []
+            except JournalError:
+                continue  # being replaced; the reader finds the new one
+            for event in news:
+                write(event)
+    except KeyboardInterrupt:
+        pass
+
+
+def _journal_path(path: Path) -> Path:
+    """The journal of a configuration, or the journal itself. Raises ConfigError."""
+    if path.suffix != ".toml":
+        return path
+    config = load(path)
+    if config.journal is None:
+        raise ConfigError(f'{path}: journal: missing; write [journal] path = "/var/lib/ucs/journal.db"')
+    return Path(config.journal.path)
+
+
+def _moment(option: str, text: str | None) -> datetime | None:
+    """A point in time as the options take it. Raises OutsideError."""
+    if text is None:
+        return None
+    try:
+        return datetime.now(UTC) - timedelta(microseconds=duration_ns(text) // 1000)
+    except ValueError:
+        pass
+    try:
+        return _utc(text)
+    except ValueError:
+        raise OutsideError(f'{option} "{text}": no time; write 2025-05-01, 2025-05-01T10:30 (UTC), or "15 min"') from None
+
+
+def _utc(text: str) -> datetime:
+    found = datetime.fromisoformat(text)
+    return found if found.tzinfo else found.replace(tzinfo=UTC)
+
+
+def _text_writer(values: bool) -> Writer:
+    def write(event: Event) -> None:
+        moment = event.utc or f"{event.t} s"
+        attempt = f" {event.attempt}" if event.attempt else ""
+        unsure = event.utc is not None and not event.utc_trusted
+        notes = " (passive)" * event.passive + " (clock not synchronised)" * unsure
+        print(f"{moment}  {event.boot}.{event.seq}  {event.alarm}  {event.event}{attempt}  {event.text}{notes}")
+        if values:
+            for name, value in event.values.items():
+                print(f"    {name} = {value}")
+            for frame in event.frames:
+                print(f"    sent {frame.message} {frame.id}#{frame.data}")
+    return write
+
+
+def _write_json(event: Event) -> None:
+    print(encode(event).decode())
+
+
+def _csv_writer() -> Writer:
+    """Columns as the keys of an event; values and frames as JSON in one cell each."""
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    started = False
+
+    def write(event: Event) -> None:
+        nonlocal started
+        if not started:
+            writer.writerow(CSV_COLUMNS)
+            started = True
+        cells = {name: getattr(event, name) for name in CSV_COLUMNS}
+        writer.writerow((cells | {"values": _json(event.values), "frames": _json(event.frames)}).values())
+    return write
+
+
+def _json(value: object) -> str:
+    return _encoder.encode(value).decode()
