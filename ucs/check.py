@@ -4,16 +4,18 @@ from __future__ import annotations
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from level1.catalog import Alarm, DefinitionError, Problem
+from level1.catalog import Alarm, Catalog, DefinitionError, Problem
 from level1.io import definitions
 from level1.io.definitions import Examination
+from level1.io.error import OutsideError
 from ucs.render import painted, wants_colour
+from ucs.words import abbreviated
 
-_UNITS_NS = (("h", 3_600_000_000_000), ("min", 60_000_000_000), ("s", 1_000_000_000), ("ms", 1_000_000))
 _SEVERITY_COLOURS = {"error": "1;31", "warning": "33"}
 
 
@@ -32,6 +34,8 @@ def add_parser(commands: Any) -> None:
         epilog="Example: ucs alarms flaming_tool.dbc")
     alarms.add_argument("file", nargs="+", metavar="FILE.dbc", help="definitions; shipped ones go by name alone")
     alarms.add_argument("--format", choices=("text", "json"), default="text", help="json: one list of objects")
+    alarms.add_argument("--handbook", metavar="OUT", help="write the alarm handbook instead, a page an alarm: OUT.html to print "
+                                                          "and hand to a driver, or OUT.md")
 
 
 def run(args: Namespace) -> int:
@@ -87,6 +91,8 @@ def _alarms(args: Namespace) -> int:
     found = definitions.examine(args.file)
     if found.catalog is None:
         raise DefinitionError(found.problems)
+    if args.handbook:
+        return _handbook(found.catalog, Path(args.handbook))
     alarms = sorted(found.catalog.alarms.values(), key=lambda alarm: alarm.code)
     if args.format == "json":
         print(msgspec.json.encode([_as_object(alarm) for alarm in alarms]).decode())
@@ -94,6 +100,19 @@ def _alarms(args: Namespace) -> int:
         _print_table(alarms)
     else:
         _print_aligned([_COLUMNS, *(_row(alarm) for alarm in alarms)])
+    return 0
+
+
+def _handbook(catalog: Catalog, out: Path) -> int:
+    from ucs import handbook
+    makers = {".html": handbook.html, ".md": handbook.markdown}
+    if out.suffix not in makers:
+        raise OutsideError(f"{out}: the handbook is written as .html or .md")
+    try:
+        out.write_text(makers[out.suffix](catalog), encoding="utf-8")
+    except OSError as error:
+        raise OutsideError(f"{out}: can't be written: {error.strerror}") from error
+    print(f"{out}: handbook of {len(catalog.alarms)} alarms")
     return 0
 
 
@@ -109,19 +128,14 @@ def _condition(alarm: Alarm) -> str:
 
 def _delays(alarm: Alarm) -> str:
     delays = (("on", alarm.on_delay_ns), ("off", alarm.off_delay_ns))
-    return ", ".join(f"{name} {duration(delay_ns)}" for name, delay_ns in delays if delay_ns) or "-"
+    return ", ".join(f"{name} {abbreviated(delay_ns)}" for name, delay_ns in delays if delay_ns) or "-"
 
 
 def _repair(alarm: Alarm) -> str:
     if alarm.repair is None:
         return "-"
     attempts = alarm.repair.attempts
-    return f"{attempts} attempt{'s' if attempts > 1 else ''} in {duration(alarm.repair.window_ns)}"
-
-
-def duration(ns: int) -> str:
-    """A duration in the largest unit that gives a whole number."""
-    return next((f"{ns // size} {unit}" for unit, size in _UNITS_NS if ns % size == 0), f"{ns / 1_000_000:g} ms")
+    return f"{attempts} attempt{'s' if attempts > 1 else ''} in {abbreviated(alarm.repair.window_ns)}"
 
 
 def _as_object(alarm: Alarm) -> dict[str, Any]:
