@@ -50,6 +50,14 @@ class Simulation:
         if isinstance(participant, Storyteller):
             self._storytellers.append(participant)
 
+    def detach(self, participant: Participant) -> None:
+        """Remove one, as if its plug were pulled; what it had ready to send is lost. Raises ValueError when it isn't there."""
+        self._participants.remove(participant)
+        if isinstance(participant, Storyteller):
+            self._storytellers.remove(participant)
+        self._waiting = [waiting for waiting in self._waiting if waiting[3] is not participant]
+        heapq.heapify(self._waiting)
+
     def run(self, until_ns: int) -> None:
         """Let time pass up to and including `until_ns`. May be called again and again."""
         same, last_ns = 0, -1

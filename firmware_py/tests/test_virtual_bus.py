@@ -88,6 +88,18 @@ def test_it_goes_on_where_it_stopped() -> None:
     assert simulation.now_ns == 5 * MS
 
 
+def test_who_is_detached_neither_sends_nor_hears() -> None:
+    first, second, listener = Talker((MS, frame(1)), (3 * MS, frame(2))), Talker((MS, frame(3)), (5 * MS, frame(4))), Talker()
+    simulation = Simulation([first, second, listener])
+    simulation.run(2 * MS)
+    simulation.detach(first)
+    simulation.run(9 * MS)
+    assert [can_id for _, can_id, _ in listener.heard] == [1, 3, 4]
+    assert [can_id for _, can_id, _ in first.heard] == [3]
+    with pytest.raises(ValueError):
+        simulation.detach(first)
+
+
 def test_a_participant_that_is_never_done_is_told_instead_of_hanging() -> None:
     class Restless(Talker):
         def next_deadline(self) -> int | None:
