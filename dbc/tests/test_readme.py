@@ -205,7 +205,9 @@ def test_the_mistakes_are_told_as_the_page_says() -> None:
     wrong, told = BLOCKS[position], BLOCKS[position + 1]
     catalog, problems = definitions.build([definitions.Source(FILE, wrong.definitions)])
     assert catalog is None
-    assert re.sub(r"(\.dbc:)\d+", r"\1…", "\n".join(map(str, problems))) == told.text.strip()
+    lines = re.sub(r"(\.dbc:)\d+", r"\1…", "\n".join(map(str, problems))).splitlines()
+    for line, shown in zip(lines, told.text.splitlines(), strict=True):
+        assert line.startswith(shown)  # the page may leave a hint out
 
 
 def reference(title: str) -> str:
