@@ -296,6 +296,8 @@ class _Resolution:
     # -- comparisons --------------------------------------------------------------------------------------------------
 
     def _comparison(self, syntax: language.Comparison) -> Typed:
+        if self._is_lost(syntax.left) and self._is_lost(syntax.right):
+            return self.typed(self._guilty(syntax.left, syntax.right))
         left = self._operand(syntax.left, syntax.right)
         right = self._operand(syntax.right, syntax.left)
         if "unknown" in (left.kind, right.kind):
@@ -327,6 +329,19 @@ class _Resolution:
             self.warning(syntax, f"always holds{why}", hint)
         else:
             self.error(syntax, f"can never hold{why}", hint)
+
+    def _is_lost(self, syntax: Syntax) -> bool:
+        """Whether a name means no signal by itself: misspelt, ambiguous, or a value name."""
+        return isinstance(syntax, language.Quoted) or (isinstance(syntax, Name) and self.scope.only(syntax) is None)
+
+    def _guilty(self, left: Syntax, right: Syntax) -> Syntax:
+        """Which of two names that mean nothing was meant as the signal: the other one is a value name and right as it is."""
+        for side in (left, right):
+            if isinstance(side, Name) and (side.owner or self.scope.find(side) or side.text in self.scope.messages):
+                return side
+        near = [side for side in (left, right)
+                if isinstance(side, Name) and similar.closest(side.text, self.scope.signal_names)]
+        return near[0] if near else left
 
     def _operand(self, syntax: Syntax, other: Syntax) -> Typed:
         """One side of a comparison: value-table names and true/false mean what they mean to the other side."""

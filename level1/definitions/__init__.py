@@ -220,7 +220,7 @@ class _Builder:
         self.alarm_count = len(alarm_places)
         scope = Scope((message for _, message in messages), {signal.name: message.name for message, signal, _ in alarm_places})
         alarms = [alarm for message, signal, place in alarm_places if (alarm := self._alarm(message, signal, place, scope))]
-        self._check_codes(alarms)
+        self._check_codes(alarm_places)
         for alarm in alarms:
             self._take_doubts(alarm, scope.messages)
         return Catalog(
@@ -302,7 +302,8 @@ class _Builder:
         return result
 
     def _check_lonely(self, place: _Place) -> None:
-        lonely = [name for name in ATTRIBUTES if name.startswith(("Alarm", "Repair")) and place.given(name)]
+        lonely = [name for name, value in place.attributes.items()
+                  if value.explicit and name in ATTRIBUTES and name.startswith(("Alarm", "Repair"))]
         if lonely:
             place.note(lonely[0], "is set, but the signal is no alarm", "give it AlarmCode and AlarmWhen", "warning")
 
@@ -379,14 +380,16 @@ class _Builder:
         place.take(attribute, text, findings)
         return steps
 
-    def _check_codes(self, alarms: Iterable[Alarm]) -> None:
-        first: dict[int, Alarm] = {}
-        for alarm in alarms:
-            other = first.setdefault(alarm.code, alarm)
-            if other is not alarm and alarm.code:
-                place = self._place_of(alarm)
-                place.note("AlarmCode", f"code {alarm.code} is used twice, first by {other.name} in {other.file}:{other.line}",
-                           f"{_free_code(alarm.code, first)} is free")
+    def _check_codes(self, alarms: Iterable[tuple[Message, Signal, _Place]]) -> None:
+        first: dict[object, _Place] = {}
+        for _, _, place in alarms:
+            if not place.given("AlarmCode"):
+                continue
+            code = place.attributes["AlarmCode"].value
+            other = first.setdefault(code, place)
+            if other is not place:
+                place.note("AlarmCode", f"code {code} is used twice, first by {other.owner[1]} in {other.path}:{other.line}",
+                           "each alarm needs its own")
 
     def _take_doubts(self, alarm: Alarm, messages: Mapping[str, Message]) -> None:
         """What is doubtful in an alarm as a whole; nothing of an attribute in which an error is known already."""
@@ -424,7 +427,3 @@ class _Builder:
         commands, findings = resolver.resolve_commands(text, message, scope)
         place.take("Commands", text, findings)
         yield from commands
-
-
-def _free_code(code: int, used: Mapping[int, object]) -> int:
-    return next(free for free in range(code, 2 * MAX_CODE) if free not in used)
