@@ -86,6 +86,11 @@ class Delivered:
         return ranges
 
 
+def delivered_path(journal: Path) -> Path:
+    """Where the bridge of a journal notes what level 2 acknowledged."""
+    return journal.with_name(journal.name + ".delivered")
+
+
 def delivered_upto(path: Path) -> dict[int, int]:
     """What `Delivered.upto` gives, for another process; empty where there is no bridge yet."""
     try:

@@ -19,6 +19,7 @@ import msgspec
 from bridge import wire
 from bridge.clock import Clock
 from bridge.delivered import Delivered
+from bridge.delivered import delivered_path as delivered_path
 from bridge.link import Answer, Beside, BridgeLink, Samples
 from bridge.mqtt import Address, MqttConnection, MqttError, Received, Tls, Waker
 from bridge.outbox import BACKLOG_PER_S, RETRY_NS, WINDOW, Outbox, Verdict
@@ -312,12 +313,6 @@ class Bridge:
                 self._publish("monitor", wire.monitor_message(sample, self._sample_seq[name]), name=name)
             except wire.WireError as error:
                 self._say_once(f"monitor {name}", str(error))
-
-
-
-def delivered_path(journal: Path) -> Path:
-    """Where the bridge of a journal notes what level 2 acknowledged."""
-    return journal.with_name(journal.name + ".delivered")
 
 
 class BridgeThread:

@@ -7,8 +7,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from bridge.broker import EmbeddedBroker
-from bridge.delivered import delivered_upto
-from bridge.session import Bridge, BridgeThread, Settings, delivered_path
+from bridge.delivered import delivered_path, delivered_upto
+from bridge.session import Bridge, BridgeThread, Settings
 from level1.io.journal import Reader
 from level2.receiver import Receiver, ReceiverThread
 from level2.receiver import Settings as ReceiverSettings
@@ -21,11 +21,12 @@ class Forwarding:
     """Embedded broker, bridge and receiver, each in a thread of its own; a context manager. Raises OutsideError.
 
     journal: of `unit`; it may be begun later. store: level 2's file. told: called, in the receiver's thread, with every
-    event that level 2 has on its disk. say: called with lines about connections and trouble.
+    event that level 2 has on its disk. say: called with lines about connections and trouble; say_bridge: with those of
+    the bridge, where they are to be told apart.
     """
 
     def __init__(self, journal: Path, unit: str, fleet: str, store: Path, told: Callable[[Arrival], None],
-                 say: Callable[[str], None]):
+                 say: Callable[[str], None], say_bridge: Callable[[str], None] | None = None):
         self.journal, self.unit = journal, unit
         self._stack = ExitStack()
         try:
@@ -34,7 +35,7 @@ class Forwarding:
             receiver = Receiver(ReceiverSettings(self.broker.address, fleet), level2, told=told, say=say)
             self.receiver: Receiver = self._stack.enter_context(ReceiverThread(receiver))
             settings = Settings(journal, unit, fleet, self.broker.address)
-            self.bridge: Bridge = self._stack.enter_context(BridgeThread(settings, say))
+            self.bridge: Bridge = self._stack.enter_context(BridgeThread(settings, say_bridge or say))
         except BaseException:
             self._stack.close()
             raise

@@ -23,6 +23,7 @@ from level1.io.journal import Journal
 from level1.io.live import Live, decode_state
 from level1.supervisor import State, Supervisor
 from ucs.render import clock, event_line, painted, wants_colour
+from ucs.uplink import Uplink
 
 
 def add_parser(commands: Any) -> None:
@@ -52,8 +53,9 @@ def run(args: Namespace) -> int:
             port.start()
             stack.callback(port.stop)
         journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name))
+        uplink = stack.enter_context(Uplink(journal, inbox, time.monotonic_ns))
         live = Live(_supervisor(settings, catalog, journal), journal, ports, inbox, clock=time.monotonic_ns,
-                    wall=time.time_ns, told=_told, notice=_notice)
+                    wall=time.time_ns, told=_told, notice=_notice, link=uplink)
         with _ended_by_signals(live):
             print(*_start_lines(settings, catalog), f"boot {journal.boot}, journal {settings.journal.path}; supervising",
                   sep="\n", flush=True)

@@ -42,10 +42,10 @@ class EventStore(Protocol):
 
 
 class Link(Protocol):
-    """The way to the bridge process; never blocks."""
+    """The way to the bridge process; never blocks. What it can't take is in the journal, or soon out of date."""
 
-    def publish(self, outputs: Sequence[Monitor | Result]) -> None:
-        """Pass on monitoring messages and answers; what can't be passed on is dropped."""
+    def publish(self, events: Sequence[Event], outputs: Sequence[Monitor | Result]) -> None:
+        """Called at every turn: events that were just journaled, monitoring messages and answers to orders."""
 
 
 class Live:
@@ -122,8 +122,8 @@ class Live:
                 self.ports[output.key >> BUS_SHIFT].send(output, now_ns)
         retries = [retry for port in self.ports if (retry := port.flush(now_ns)) is not None]
         self._retry_ns = min(retries, default=None)
-        if upward and self._link is not None:
-            self._link.publish(upward)
+        if self._link is not None:
+            self._link.publish(events, upward)
         for event in events:
             self._told(event)
         self._tell_journal()

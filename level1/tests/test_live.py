@@ -345,7 +345,8 @@ class Unit:
                               told=lambda event: self.log.append(("told", event)),
                               notice=lambda text: self.log.append(("notice", text)), link=self)
 
-    def publish(self, outputs: Sequence[Monitor | Result]) -> None:
+    def publish(self, events: Sequence[Event], outputs: Sequence[Monitor | Result]) -> None:
+        self.log.extend(("heads up", event.event) for event in events)
         self.log.extend(("link", output) for output in outputs)
 
     def status(self, t_ns: int, **raws: int) -> None:
@@ -374,8 +375,9 @@ class TestLive:
         journal = happened.index(("journal", ["raised", "repair_started"]))
         assert all(entry[0] != "told" for entry in happened[:journal])
         commands = [place for place, entry in enumerate(happened) if entry[:2] == ("bus", 0x110)]
+        upward = happened.index(("heads up", "raised"))
         told = [place for place, entry in enumerate(happened) if entry[0] == "told"]
-        assert commands and told and journal < min(commands) and max(commands) < min(told)
+        assert commands and told and journal < min(commands) and max(commands) < upward < min(told)
 
     def test_a_deadline_counts_at_its_own_time_however_late_it_is_served(self, catalog: Catalog) -> None:
         unit = Unit(catalog)

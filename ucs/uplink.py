@@ -1,0 +1,71 @@
+"""`ucs run`'s end of the way to the bridge process: what the live loop hands over, and the orders that come back."""
+from __future__ import annotations
+
+import os
+import select
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from bridge.delivered import delivered_path, delivered_upto
+from bridge.link import RunLink
+from level1.event import Event, Monitor, Result
+from level1.io.inbox import Inbox
+from level1.io.journal import Journal
+
+ALIVE_NS = 500_000_000
+"""So often the bridge hears at least that supervision is alive; it gives it up after 2 s."""
+BESIDE_NS = 2_000_000_000
+"""So often the events that the journal can't take are handed over again: nobody says whether they arrived."""
+
+PRUNE_S = 60.0
+"""So often the journal learns what level 2 has, and may shrink to its bound."""
+
+
+class Uplink:
+    """A context manager. publish is called by the live loop, which alone shows that supervision is alive."""
+
+    def __init__(self, journal: Journal, inbox: Inbox, clock: Callable[[], int]):
+        self._link = RunLink(Path(journal.path))
+        self._journal, self._inbox, self._clock = journal, inbox, clock
+        self._alive_due_ns = self._beside_due_ns = 0
+        self._wake, self._awake = os.pipe()
+        self._thread = threading.Thread(target=self._listen, name="orders", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Uplink:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.write(self._awake, b".")
+        self._thread.join()
+        self._link.close()
+        os.close(self._wake)
+        os.close(self._awake)
+
+    def publish(self, events: Sequence[Event], outputs: Sequence[Monitor | Result]) -> None:
+        """Hand over what is new, without waiting for anyone."""
+        now_ns = self._clock()
+        if events:
+            self._link.poke()
+        for output in outputs:
+            if isinstance(output, Result):
+                self._link.answer(output)
+        monitors = [output for output in outputs if isinstance(output, Monitor)]
+        if monitors or now_ns >= self._alive_due_ns:
+            self._alive_due_ns = now_ns + ALIVE_NS
+            self._link.send_samples(*monitors)
+        if now_ns >= self._beside_due_ns and (pending := self._journal.pending):
+            self._beside_due_ns = now_ns + BESIDE_NS
+            self._link.send_beside(pending)
+
+    def _listen(self) -> None:
+        """Orders, until the end; and now and then what level 2 has acknowledged."""
+        while True:
+            readable, _, _ = select.select([self._link.fileno(), self._wake], [], [], PRUNE_S)
+            if self._wake in readable:
+                return
+            for instruct in self._link.receive():
+                self._inbox.order(instruct.order)
+            if not readable:
+                self._journal.prune(delivered_upto(delivered_path(Path(self._journal.path))))
