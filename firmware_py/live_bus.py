@@ -52,6 +52,7 @@ class LiveBus:
         self._open_bus = open_bus
         self._name = name
         self._participants = list(participants)
+        self._storytellers = [participant for participant in self._participants if isinstance(participant, Storyteller)]
         self._clock = clock
         self._tell = tell
         self._patience_ns = patience_ns
@@ -83,11 +84,10 @@ class LiveBus:
                 for frame in participant.step(now_ns):
                     if self._send(now_ns, frame):
                         self._hear(now_ns, frame, participant)
-        if self._on_happening is not None:
-            for participant in self._participants:
-                if isinstance(participant, Storyteller):
-                    for happening in participant.take_happenings():
-                        self._on_happening(happening)
+        for storyteller in self._storytellers:
+            for happening in storyteller.take_happenings():
+                if self._on_happening is not None:
+                    self._on_happening(happening)
 
     def _hear(self, now_ns: int, frame: BusFrame, sender: Participant | None) -> None:
         self.frames += 1

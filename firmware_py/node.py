@@ -99,6 +99,8 @@ class Node:
 
     def take_happenings(self) -> list[Happening]:
         """What happened since the last call."""
+        if not self._happenings:
+            return []
         happenings, self._happenings = self._happenings, []
         return happenings
 

@@ -90,9 +90,9 @@ class Simulation:
         if self._carried is None and self._waiting:
             _, _, frame, sender = heapq.heappop(self._waiting)
             self._carried = (t_ns + self._duration_ns(frame), frame, sender)
-        if self.on_happening is not None:
-            for storyteller in self._storytellers:
-                for happening in storyteller.take_happenings():
+        for storyteller in self._storytellers:
+            for happening in storyteller.take_happenings():
+                if self.on_happening is not None:
                     self.on_happening(happening)
 
     def _deliver(self, t_ns: int) -> None:

@@ -138,11 +138,14 @@ def _terminable() -> Iterator[None]:
 
 
 def _run_live(args: argparse.Namespace, scenario: Scenario, cast: Cast, on_frame: Callable[[int, BusFrame], None] | None) -> int:
+    import logging
+
     import can
 
     from firmware_py.live_bus import BusLost, LiveBus
     if args.bus and (args.interface or args.channel):
         raise OutsideError("--bus names a SocketCAN interface: give it, or --interface and --channel, not both")
+    logging.getLogger("can").addHandler(logging.NullHandler())  # python-can would print each failed attempt to open a lost bus
     options: dict[str, Any] = {"interface": args.interface or PYTHON_CAN_DEFAULT, "channel": args.bus or args.channel}
     if args.bitrate:
         options["bitrate"] = args.bitrate
@@ -160,8 +163,9 @@ def _run_live(args: argparse.Namespace, scenario: Scenario, cast: Cast, on_frame
     except BusLost as error:
         raise OutsideError(str(error)) from error
     finally:
-        sys.stdout.write(_summary(cast, clock.now_ns(), bus.frames))
-        sys.stdout.flush()
+        if bus.frames:
+            sys.stdout.write(_summary(cast, clock.now_ns(), bus.frames))
+            sys.stdout.flush()
     return 0
 
 

@@ -1,6 +1,9 @@
 """Scenario files: what they say, and every mistake told with its line."""
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 
 from firmware_py.fault import Statement
@@ -125,6 +128,14 @@ def test_faults_happen_at_their_times() -> None:
     Simulation(build(scenario).participants,
                on_happening=lambda happening: happenings.append((happening.t_ns, happening.text))).run(10 * S)
     assert happenings == [(2 * S, "fault: silent"), (5 * S, "works again")]
+
+
+def test_the_scenario_of_the_readme_runs() -> None:
+    text = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
+    (example,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    simulation = Simulation(build(parse(example, "README.md")).participants)
+    simulation.run(10 * S)
+    assert simulation.frames > 100
 
 
 def test_every_phrase_of_every_program_can_be_written() -> None:
