@@ -98,7 +98,8 @@ class Repair(msgspec.Struct, frozen=True):
     """The local repair of an alarm: steps, the steps into the safe state, and the budget (DESIGN §5).
 
     moves: it moves something, so it is inhibited while the unit is stopped or paused from above (attribute RepairMoves,
-    default Yes). local_reset: a lock-out can only be reset on board (attribute RepairReset, default Local).
+    default Yes). safe_between: a failed attempt enters the safe state at once; else (attribute RepairBetween, AsCommanded) its
+    messages return to what was commanded before the episode, and each attempt begins from there. local_reset: a lock-out can only be reset on board (attribute RepairReset, default Local).
     """
 
     steps: tuple[Step, ...]
@@ -108,6 +109,7 @@ class Repair(msgspec.Struct, frozen=True):
     pause_ns: int = 0
     moves: bool = True
     local_reset: bool = True
+    safe_between: bool = True
     text: str = ""
     give_up_text: str = ""
 

@@ -150,11 +150,14 @@ def quality_of(signal: Signal, j1939: bool, raw: RawValue) -> int:
     return classes.quality[classes.of(raw)]
 
 
+def first_bit(signal: Signal) -> int:
+    """Distance of the signal's first bit from the first bit of the payload, counted in the signal's own byte order."""
+    return _motorola_position(signal) if signal.big_endian else signal.start
+
+
 def last_byte(signal: Signal) -> int:
     """Index of the highest payload byte that the signal touches."""
-    if not signal.big_endian:
-        return (signal.start + signal.length - 1) // 8
-    return (_motorola_position(signal) + signal.length - 1) // 8
+    return (first_bit(signal) + signal.length - 1) // 8
 
 
 def _motorola_position(signal: Signal) -> int:
@@ -250,7 +253,7 @@ def compile_handler(message: Message, signals: list[tuple[Signal, Any]], touch: 
 def _in_one_byte(signal: Signal) -> bool:
     if signal.is_float:
         return False
-    first = _motorola_position(signal) if signal.big_endian else signal.start
+    first = first_bit(signal)
     return first // 8 == (first + signal.length - 1) // 8
 
 

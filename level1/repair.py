@@ -1,11 +1,13 @@
 """The local repair of one alarm, reported as an episode (DESIGN §4, §5).
 
 Theory of operation. An *attempt* runs the steps of the definition to their end, also when the condition clears in between
-(the igniter must go off again). It succeeds when its last step is done and the alarm's condition no longer holds. It fails at
-once when an `expect` runs out, when its feedback is lost, or when the unit is stopped or paused from above. **A failed attempt
-enters the safe state (the sends of RepairGiveUp) immediately**, before the pause: an ignition trial that failed must not leave
-the valve open while the next one is awaited. When as many attempts as the budget allows have begun within its window, the next
-failure, or the next activation, locks the alarm out: safe state, held until a reset on board.
+(the igniter must go off again). It succeeds when its last step is done and the alarm's condition no longer holds. It fails
+at once when an `expect` runs out, when its feedback is lost, or when the unit is stopped or paused from above. **A failed
+attempt enters the safe state (the sends of RepairGiveUp) immediately**, before the pause: an ignition trial that failed
+must not leave the valve open while the next one is awaited. Only where the definition says that trying again is harmless
+(RepairBetween AsCommanded) do its messages return to what was commanded before the episode instead, and each attempt begins
+from that. When as many attempts as the budget allows have begun within its window, the next failure, or the next
+activation, locks the alarm out: safe state, held until a reset on board.
 
 From the first attempt to the end of the episode the repair owns its command messages: it repeats them at their cycle time,
 and the alarm signal on the bus reads Repairing, upon which other programs stop sending them. One message serves one repair at a
@@ -49,6 +51,9 @@ class Host(Protocol):
 
     def transmit(self, owner: RepairMachine, t_ns: int, step: SendStep | ResendStep) -> None:
         """Send a step's frame and go on repeating it. Raises gate.Refused."""
+
+    def restore_commands(self, owner: RepairMachine, t_ns: int) -> None:
+        """Return its messages to what was commanded before the episode."""
 
     def preview(self, owner: RepairMachine, steps: Sequence[Step]) -> tuple[SentFrame, ...]:
         """The frames that these steps send."""
@@ -252,7 +257,10 @@ class RepairMachine:
         if self.spent(t_ns):
             self.lock_out(t_ns, "the last attempt of the budget has failed")
             return
-        self._safe_state(t_ns)
+        if self.definition.safe_between:
+            self._safe_state(t_ns)
+        else:
+            self.host.restore_commands(self, t_ns)
         self.phase = PAUSING
         if self.definition.pause_ns:
             self.timers.set(self, t_ns + self.definition.pause_ns)

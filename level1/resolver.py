@@ -649,6 +649,19 @@ def _message_hint(scope: Scope, syntax: Syntax) -> str:
     return f"write silent({pair[0].name})" if pair else similar.hint(str(syntax), scope.messages)
 
 
+def _integrity(kind: Literal["corrupt", "frozen"]) -> Callable[[_Resolution, language.Call], Typed]:
+    def resolve(resolution: _Resolution, call: language.Call) -> Typed:
+        message = resolution.message_argument(call)
+        if message is None:
+            return resolution.error(call.arguments[0], f"{kind} takes a message", f"write {FUNCTIONS[kind].usage}")
+        wanted = ("Counter",) if kind == "frozen" else ("Counter", "Checksum")
+        if not any(signal.role in wanted for signal in message.signals):
+            return resolution.error(call.arguments[0], f"{message.name} has no {' or '.join(wanted).lower()} to tell it by",
+                                    "set the attribute Role on the signal that is one")
+        return Typed("boolean", Quality(kind, message.name, ""))
+    return resolve
+
+
 def _quality(kind: Literal["error", "unavailable", "never"]) -> Callable[[_Resolution, language.Call], Typed]:
     def resolve(resolution: _Resolution, call: language.Call) -> Typed:
         message = resolution.message_argument(call)
@@ -719,6 +732,8 @@ FUNCTIONS: Mapping[str, FunctionSpec] = {
     "error": FunctionSpec("error(Signal)", 1, 1, "its last sample is invalid", _quality("error")),
     "unavailable": FunctionSpec("unavailable(Signal)", 1, 1, "its sender says that it has no value", _quality("unavailable")),
     "never": FunctionSpec("never(Signal or Message)", 1, 1, "it was never received", _quality("never")),
+    "corrupt": FunctionSpec("corrupt(Message)", 1, 1, "its checksum is wrong or its counter stepped back", _integrity("corrupt")),
+    "frozen": FunctionSpec("frozen(Message)", 1, 1, "its counter stands still", _integrity("frozen")),
     "dtc": FunctionSpec("dtc(SPN) or dtc(SPN, FMI)", 1, 2, "that J1939 trouble code is active", _dtc),
 }
 """Every function of the language."""

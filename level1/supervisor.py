@@ -17,7 +17,7 @@ import msgspec
 
 from level1.alarm import AlarmMachine
 from level1.board import ALWAYS, Board, Cell, Page, Watch
-from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Catalog, Command, Message, Repair
+from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Alarm, Catalog, Command, Message, Repair
 from level1.command import Order
 from level1.condition import Compiler, Things, Thresholds, Verdict, Zone, walk
 from level1.decode import GOOD, QUALITY_WORDS, RawValue, encode
@@ -297,7 +297,7 @@ class Supervisor:
             alarm = machine.definition
             evaluate, cells = compiler.zone(alarm.when, alarm.until, alarm.enabled)
             self._watch(evaluate, cells, machine.zone_changed, UNTOLD)
-            self._inputs[name] = self._freeze_frame(alarm.when)
+            self._inputs[name] = self._freeze_frame(alarm)
             if alarm.repair is not None:
                 self._compile_repair(machine, alarm.repair, compiler)
         for (name, window_ns), cell in things.counts.items():
@@ -342,7 +342,7 @@ class Supervisor:
 
     def _use_for_repairs_and_monitoring(self) -> None:
         for alarm in self.catalog.alarms.values():
-            for expression in walk(alarm.when):
+            for expression in chain(walk(alarm.when), walk(alarm.enabled)):
                 if isinstance(expression, (SignalValue, Quality)) and expression.signal:
                     self.board.cell(expression.message, expression.signal)
         for message in self.catalog.messages.values():
@@ -386,10 +386,10 @@ class Supervisor:
         for position, (evaluate, cells) in compiled.items():
             self._watch(evaluate, cells, _expectation(episode, position), Verdict.FALSE)
 
-    def _freeze_frame(self, when: Expression) -> list[tuple[str, Callable[[int], Any]]]:
-        """What to record when an alarm is raised: every input of its condition, by name."""
+    def _freeze_frame(self, alarm: Alarm) -> list[tuple[str, Callable[[int], Any]]]:
+        """What to record with every event of an alarm: the inputs of its condition and of what enables it, by name."""
         inputs: dict[str, Callable[[int], Any]] = {}
-        for node in walk(when):
+        for node in chain(walk(alarm.when), walk(alarm.enabled)):
             match node:
                 case SignalValue(message=message, signal=signal) | Rate(message=message, signal=signal):
                     cell = self.board.cell(message, signal)
@@ -399,10 +399,10 @@ class Supervisor:
                     inputs[cell.name] = _reader(self.board, cell)
                 case Silent(message=message) | Quality(message=message) | Elapsed(message=message):
                     inputs[message] = _silence(self.board.page(message))
-                case AlarmState(alarm=alarm):
-                    inputs[alarm] = _state_word(self._alarms[alarm])
-                case Count(alarm=alarm, window_ns=window):
-                    inputs[f"count({alarm})"] = _count(self._things.count(alarm, window))
+                case AlarmState(alarm=other):
+                    inputs[other] = _state_word(self._alarms[other])
+                case Count(alarm=other, window_ns=window):
+                    inputs[f"count({other})"] = _count(self._things.count(other, window))
                 case _:
                     pass
         return list(inputs.items())
@@ -471,14 +471,35 @@ class Supervisor:
         for hold in holds:
             if hold.owner is not None and hold.owner is not owner:
                 hold.owner.taken(t_ns, owner.alarm.definition.name)
+                hold.payload = b""
+            if hold.owner is not owner:
+                hold.before = self._last_command(hold.message.name)
             hold.owner = owner
         return ""
+
+    def restore_commands(self, owner: RepairMachine, t_ns: int) -> None:
+        """Return a repair's messages to what was commanded before the episode, where anyone did."""
+        for hold in self._holds.values():
+            if hold.owner is owner and hold.before is not None:
+                hold.payload = hold.before
+                self._repeat(hold, t_ns)
+
+    def _repeat(self, hold: _Hold, t_ns: int) -> None:
+        if hold.owner is None:
+            return
+        try:
+            self.send(t_ns, hold.message.name, hold.payload, f"held by the repair of {hold.owner.alarm.definition.name}")
+        except Refused:
+            self.counters["frames refused by the gate"] += 1
+        if hold.message.cycle_ns:
+            self.timers.set(hold, t_ns + hold.message.cycle_ns)
 
     def release(self, owner: RepairMachine, t_ns: int) -> None:
         """Hand command messages back, and let those who wait for one try again."""
         freed = [hold for hold in self._holds.values() if hold.owner is owner]
         for hold in freed:
             hold.owner = None
+            hold.payload = b""
             hold.due = FAR
         if freed:
             self._circumstances_changed(t_ns)
@@ -486,7 +507,7 @@ class Supervisor:
     def transmit(self, owner: RepairMachine, t_ns: int, step: SendStep | ResendStep) -> None:
         """Send a step's frame now, and go on repeating it at its cycle time while the episode lasts. Raises Refused."""
         hold = self._hold(step.message)
-        payload = self._payload(step, t_ns)
+        payload = self._payload(step, hold.payload if hold.owner is owner and hold.payload else self._last_command(step.message))
         self.send(t_ns, step.message, payload, f"repair of {owner.alarm.definition.name}")
         hold.payload = payload
         if hold.message.cycle_ns:
@@ -532,8 +553,8 @@ class Supervisor:
             return None
         return page.data
 
-    def _payload(self, step: SendStep | ResendStep, t_ns: int) -> bytes:
-        last = self._last_command(step.message)
+    def _payload(self, step: SendStep | ResendStep, last: bytes | None) -> bytes:
+        """What a step sends, given what was commanded last: by this repair while it owns the message, whatever others send then."""
         if isinstance(step, SendStep):
             return encode(self.catalog.messages[step.message], step.values, last)
         if last is None:
@@ -678,17 +699,11 @@ class _Hold:
         self.due = FAR
         self.owner: RepairMachine | None = None
         self.payload = b""
+        self.before: bytes | None = None
 
     def expire(self, now_ns: int) -> None:
         """Repeat it."""
-        if self.owner is None or not self.message.cycle_ns:
-            return
-        supervisor = self.supervisor
-        supervisor.timers.set(self, now_ns + self.message.cycle_ns)
-        try:
-            supervisor.send(now_ns, self.message.name, self.payload, f"held by the repair of {self.owner.alarm.definition.name}")
-        except Refused:
-            supervisor.counters["frames refused by the gate"] += 1
+        self.supervisor._repeat(self, now_ns)
 
 
 class _Broadcast:

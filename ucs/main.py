@@ -27,6 +27,7 @@ COMMANDS = {
     "demo": Command("ucs.demo", "a simulated tractor loses its pilot flame, told as it happens"),
     "check": Command("ucs.check", "check alarm definitions in DBC files"),
     "alarms": Command("ucs.check", "list the alarms that DBC files define"),
+    "new": Command("ucs.new", "write a DBC file to start your own alarms from"),
     "run": Command("ucs.run", "supervise a unit live"),
     "replay": Command("ucs.replay", "run alarm definitions over recordings"),
     "simulate": Command("ucs.simulate", "simulate the nodes on the bus, with faults as a scenario says"),

@@ -15,11 +15,13 @@ import msgspec
 
 from level1 import check, resolver, similar
 from level1.catalog import Alarm, Catalog, Command, Message, Problem, Repair, Signal
+from level1.decode import first_bit
 from level1.definitions import dbc_file
 from level1.definitions.dbc_file import Attribute, DbcFile
 from level1.event import PRIORITIES
 from level1.expression import Expression, Step
 from level1.frame import frame_key
+from level1.protection import CHECKSUMS
 from level1.resolver import Finding, Scope
 
 MS, S = 1_000_000, 1_000_000_000
@@ -76,7 +78,9 @@ ATTRIBUTES: Mapping[str, AttributeSpec] = {
     "RepairGiveUp": _TEXT,
     "RepairMoves": AttributeSpec("SG_", ("ENUM",), ("No", "Yes")),
     "RepairReset": AttributeSpec("SG_", ("ENUM",), ("Local", "FromAbove")),
+    "RepairBetween": AttributeSpec("SG_", ("ENUM",), ("SafeState", "AsCommanded")),
     "Role": AttributeSpec("SG_", ("ENUM",), ("None", "Counter", "Checksum")),
+    "ChecksumType": AttributeSpec("SG_", ("ENUM",), tuple(CHECKSUMS)),
     "MonitorAs": AttributeSpec("BO_", ("STRING",)),
     "Commands": AttributeSpec("BO_", ("STRING",)),
 }
@@ -187,7 +191,7 @@ class _Place:
         value = self.attributes.get(name)
         if value is None:
             return default
-        if not isinstance(value.value, int | float) or value.value != int(value.value) or not low <= value.value <= high:
+        if not isinstance(value.value, int | float) or not low <= value.value <= high or value.value != int(value.value):
             if value.explicit:
                 self.note(name, f"{value.value} is not possible", f"whole numbers from {low} to {high}")
             return default
@@ -266,9 +270,27 @@ class _Builder:
         return list(result.values())
 
     def _with_attributes(self, file: DbcFile, message: Message) -> Message:
-        signals = tuple(msgspec.structs.replace(signal, role=self._place(file, message, signal).word("Role", "None"))
-                        if self._place(file, message, signal).given("Role") else signal for signal in message.signals)
+        signals = tuple(self._with_role(signal, self._place(file, message, signal)) for signal in message.signals)
+        for role in ("Counter", "Checksum"):
+            bearers = [signal for signal in signals if signal.role == role]
+            for signal in bearers[1:]:
+                self._place(file, message, signal).note("Role", f"{message.name} has a {role.lower()} already: {bearers[0].name}",
+                                                        "a message has one of each at the most")
         return msgspec.structs.replace(message, signals=signals, monitor_as=self._place(file, message).text("MonitorAs"))
+
+    def _with_role(self, signal: Signal, place: _Place) -> Signal:
+        if not place.given("Role"):
+            return signal
+        role, checksum = place.word("Role", "None"), place.word("ChecksumType", next(iter(CHECKSUMS)))
+        whole = signal.factor == 1 and signal.offset == 0 and not signal.signed and not signal.is_float
+        if role != "None" and (not whole or signal.multiplexer_ids is not None):
+            place.note("Role", f"a {role.lower()} is an unsigned whole number that is in every frame",
+                       "factor 1, offset 0, not multiplexed")
+            return signal
+        if role == "Checksum" and (signal.length != 8 or first_bit(signal) % 8):
+            place.note("Role", "a checksum takes one whole byte", "8 bits, beginning at a byte boundary")
+            return signal
+        return msgspec.structs.replace(signal, role=role, checksum=checksum)
 
     def _check_ids(self, messages: Iterable[tuple[DbcFile, Message]]) -> None:
         seen: dict[object, Message] = {}
@@ -370,6 +392,7 @@ class _Builder:
             return None
         return Repair(steps=steps, give_up=give_up, attempts=attempts, window_ns=window * S, pause_ns=pause * MS,
                       moves=moves == "Yes", local_reset=reset == "Local", text=place.text("Repair"),
+                      safe_between=place.word("RepairBetween", "SafeState") == "SafeState",
                       give_up_text=place.text("RepairGiveUp"))
 
     def _steps(self, attribute: str, place: _Place, scope: Scope) -> tuple[Step, ...]:

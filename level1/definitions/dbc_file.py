@@ -6,11 +6,10 @@ a `Problem`. Pure: text in, values out.
 from __future__ import annotations
 
 import contextlib
-import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from decimal import Decimal
+from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING, Any
 
 import cantools.database.can
@@ -32,8 +31,12 @@ if TYPE_CHECKING:
 
 ANY_SOURCE = 0xFE
 """Source address in a J1939 identifier that stands for any (J1939-81: the null address; DESIGN §3)."""
+MAX_CYCLE_MS = 86_400_000
+"""Longest cycle time taken seriously: a day."""
 MAX_VIOLATIONS = 20
 """Exceeded limits told of one file; a hostile one may have thousands."""
+_END = "\nBS_:\n"
+"""Put behind the text: cantools has no error of its own for a text that ends inside a statement."""
 
 Owner = tuple[str, str]
 """Message name and signal name ("" for the message itself): whose attribute it is."""
@@ -164,16 +167,17 @@ class _Reader:
     def _parse(self) -> cantools.database.can.Database | None:
         database = cantools.database.can.Database(strict=False, sort_signals=None)
         try:
-            database.add_dbc_string(self._text.without(self._blanked))
+            database.add_dbc_string(self._text.without(self._blanked) + _END)
         except ParseError as error:
             self._problem(*self._syntax_error(error))
         except CantoolsError as error:
             self._problem(self._line_of_message(str(error)), str(error).rstrip("."))
-        except (ValueError, TypeError, KeyError, IndexError, AssertionError, AttributeError, ArithmeticError,
+        except ValueError as error:
+            self._problem(*self._value_error(str(error)))
+        except (TypeError, KeyError, IndexError, AssertionError, AttributeError, ArithmeticError,
                 NotImplementedError, RecursionError) as error:
             # cantools trusts its input; whatever it trips over is a mistake in the file
-            self._problem(0, f"the DBC reader can't make sense of it ({type(error).__name__}: {str(error)[:200]})",
-                          "open it in a DBC editor and save it again")
+            self._problem(*_senseless(error))
         else:
             return database
         return None
@@ -182,10 +186,20 @@ class _Reader:
         lines = self._text.text.split("\n")
         line = int(error.line)
         column = int(error.column)
-        found = re.match(r"\w+|.?", lines[line - 1][column - 1:column + 40] if line <= len(lines) else "")
+        if line > len(lines):
+            return len(lines), "the file ends inside a statement", "is it complete? the closing `;` may be missing"
+        found = re.match(r"\w+|.?", lines[line - 1][column - 1:column + 40])
         token = found.group() if found else ""
         what = f"`{token}` in column {column}" if token else f"column {column}"
         return line, f"not a valid DBC file: {what} is not expected here", "the statement may have begun on a line before"
+
+    def _value_error(self, text: str) -> tuple[int, str, str]:
+        literal = re.match(r"invalid literal for int\(\) with base \d+: '(.*)'$", text)
+        if literal is None:
+            return _senseless(ValueError(text))
+        places = list(re.finditer(rf"(?<![\w.]){re.escape(literal[1])}(?![\w.])", self._text.text))
+        line = self._text.line_at(places[0].start()) if len(places) == 1 else 0
+        return line, f"`{literal[1][:40]}` stands where a whole number belongs", "write it without point and exponent"
 
     def _line_of_message(self, text: str) -> int:
         return next((m.line for m in self._text.messages if text.endswith(f"in message {m.name}.")), 0)
@@ -215,9 +229,20 @@ class _Reader:
         self._find_overlaps(parsed, text, signals)
         return Message(
             name=parsed.name, can_id=parsed.frame_id, extended=parsed.is_extended_frame, length=parsed.length, signals=signals,
-            senders=tuple(parsed.senders), cycle_ns=_cycle_ns(parsed.cycle_time), j1939=j1939,
+            senders=tuple(parsed.senders), cycle_ns=self._cycle_ns(parsed, text), j1939=j1939,
             pgn=j1939_pgn(parsed.frame_id) if j1939 else None, source=source if j1939 and source != ANY_SOURCE else None,
             is_fd=parsed.is_fd, comment=parsed.comment or "", file=self._path, line=text.line)
+
+    def _cycle_ns(self, parsed: DbcMessage, text: MessageText) -> int | None:
+        if not parsed.cycle_time:
+            return None
+        with contextlib.suppress(InvalidOperation):  # a file may define it as text
+            cycle_ms = Decimal(str(parsed.cycle_time))
+            if 0 <= cycle_ms <= MAX_CYCLE_MS:
+                return int(cycle_ms * 1_000_000) or None
+        self._problem(text.line, "its cycle time is not possible: ignored", f"1 to {MAX_CYCLE_MS} ms", where=parsed.name,
+                      attribute="GenMsgCycleTime", severity="warning")
+        return None
 
     def _signal(self, message: DbcMessage, parsed: DbcSignal, text: SignalText) -> Signal:
         where = f"{message.name}.{parsed.name}"
@@ -259,9 +284,9 @@ class _Reader:
         if signal.is_float and signal.length in FLOAT_LENGTHS:
             with contextlib.suppress(OverflowError):
                 return float_bits(float(initial), signal.length)
-        elif math.isfinite(initial) and int(initial) == initial:
+        else:
             low, high = raw_range(signal)
-            if low <= initial <= high:
+            if low <= initial <= high and int(initial) == initial:
                 return int(initial)
         self._problem(line, f"start value {initial} is no raw value of {signal.length} bits: 0 is taken", where=where,
                       attribute="GenSigStartValue", severity="warning")
@@ -315,8 +340,9 @@ def _lines(parsed: DbcMessage, text: MessageText) -> Iterator[tuple[Owner, int]]
         yield (parsed.name, signal.name), line.line
 
 
-def _cycle_ns(cycle_ms: Any) -> int | None:
-    return round(float(cycle_ms) * 1_000_000) if cycle_ms and float(cycle_ms) > 0 else None
+def _senseless(error: Exception) -> tuple[int, str, str]:
+    return (0, f"the DBC reader can't make sense of it ({type(error).__name__}: {' '.join(str(error).split())[:200]})",
+            "open it in a DBC editor and save it again")
 
 
 def _id_text(identifier: int) -> str:

@@ -23,8 +23,10 @@ from level1.tests.build import (
     alarm,
     compare,
     events,
+    message,
     pilot_flame_out,
     sends,
+    signal,
     status,
     supervisor,
 )
@@ -315,3 +317,35 @@ def test_no_sequence_of_inputs_opens_the_valve_without_a_finished_purge_and_chec
                 now += 100 * MS
         else:
             judge(target.command(Order("x", action, "PilotFlameOut", origin="local" if flaming else "above"), now))
+
+
+VALVES = message("VALVES", 0x401, [signal("Set", 0, 8)], senders=("UCS", "MISSION"))
+ACTUAL = message("ACTUAL", 0x402, [signal("Is", 0, 8)])
+
+
+def test_a_harmless_repair_is_tried_again_from_what_was_commanded_before_it() -> None:
+    """Nozzles re-sent at most three times; only the lock-out closes them (RepairBetween AsCommanded)."""
+    steps = (ResendStep("VALVES"), ExpectStep(compare("ACTUAL.Is", "==", 7), SECOND, "Is == 7"))
+    repair = Repair(steps, (SendStep("VALVES", {"Set": 0}),), attempts=3, safe_between=False, pause_ns=500 * MS)
+    wrong = alarm("Wrong", compare("ACTUAL.Is", "!=", 7), on_delay_ns=SECOND, repair=repair)
+    target = supervisor([VALVES, ACTUAL], [wrong])
+    outputs: list[Output] = []
+    for n in range(70):
+        t = n * 100 * MS
+        if n < 11:
+            outputs += target.receive(Frame(t, frame_key(0x401, False), b"\x07" + bytes(7)))
+        outputs += target.receive(Frame(t, frame_key(0x402, False), b"\x03" + bytes(7)))
+    assert words(events(outputs)) == ["raised", *["repair_started", "repair_failed"] * 3, "locked_out"]
+    lock_out = next(out.t for out in outputs if isinstance(out, Event) and out.event == "locked_out")
+    sent = sends(outputs, "VALVES")
+    assert {send.data[0] for send in sent if send.t_ns < lock_out * SECOND} == {7}
+    assert {send.data[0] for send in sent if send.t_ns > lock_out * SECOND} == {0}
+
+
+def test_a_stranger_on_a_held_message_does_not_get_into_the_repair() -> None:
+    tool = flamer()
+    tool.flame = 0
+    tool.run(10)
+    tool.target.receive(Frame(tool.now, frame_key(COMMAND.can_id, False), b"\x01\xaa" + bytes(6)))
+    tool.run(30)
+    assert {send.data[1] for send in sends(tool.outputs, "FLAMER_CMD")} == {0}
