@@ -1,0 +1,105 @@
+"""A bus that is missing, goes down, or is taken away and comes back, seen by `ucs run` on real SocketCAN."""
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from hil_tests.conftest import Process
+from level1.decode import encode
+from level1.io.definitions import load
+
+pytestmark = pytest.mark.vcan
+
+START_S = 30.0
+UNIT = """
+[unit]
+name = "tractor-7"
+[[bus]]
+name = "implement"
+channel = "{channel}"
+dbc = ["flaming_tool.dbc"]
+[journal]
+path = "journal.db"
+"""
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Callable[[str], Path]:
+    """Writes a unit.toml for a channel."""
+
+    def write(channel: str) -> Path:
+        file = tmp_path / f"{channel}.toml"
+        file.write_text(UNIT.format(channel=channel))
+        return file
+
+    return write
+
+
+@pytest.fixture
+def remake() -> Iterator[Callable[[], None]]:
+    """Takes vcan0 away when called; makes it anew when called again, and at the end if need be."""
+    gone = False
+
+    def link(*words: str) -> None:
+        subprocess.run(["ip", "link", *words], check=True)
+
+    def toggle() -> None:
+        nonlocal gone
+        if gone:
+            link("add", "vcan0", "type", "vcan")
+            link("set", "vcan0", "mtu", "72", "up")
+        else:
+            link("del", "vcan0")
+        gone = not gone
+
+    yield toggle
+    if gone:
+        toggle()
+
+
+def lose_the_flame() -> None:
+    """What a flaming tool says for half a second whose pilot flame is out."""
+    message = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
+    payload = encode(message, {"Flaming": 1, "PilotFlame": 0}, None)
+    with can.Bus(channel="vcan0", interface="socketcan") as bus:
+        for _ in range(6):
+            bus.send(can.Message(arbitration_id=message.can_id, is_extended_id=False, data=payload))
+            time.sleep(0.1)
+
+
+@pytest.mark.parametrize("away", ["down", "deleted"])
+def test_a_bus_that_comes_back_is_heard_again_without_a_restart(
+        away: str, process: Callable[..., Process], unit: Callable[[str], Path], set_link: Callable[[str, bool], None],
+        remake: Callable[[], None]) -> None:
+    run = process("run", unit("vcan0"))
+    run.expect("; supervising$", START_S)
+    if away == "down":
+        set_link("vcan0", False)
+    else:
+        remake()
+    run.expect("bus implement: lost .*trying again", 5)
+    if away == "down":
+        set_link("vcan0", True)
+    else:
+        remake()
+    run.expect("bus implement: back after", 5)
+    lose_the_flame()
+    run.expect("PilotFlameOut +raised", 5)
+    assert run.stop() == 0
+
+
+def test_a_missing_interface_and_one_that_is_down_say_what_to_do(
+        process: Callable[..., Process], unit: Callable[[str], Path], set_link: Callable[[str, bool], None]) -> None:
+    missing = process("run", unit("vcan7"))
+    assert missing.wait(START_S) == 2
+    assert missing.err == ["ucs: bus implement: there is no interface vcan7; create it: ip link add vcan7 type vcan && "
+                           "ip link set vcan7 up"]
+    set_link("vcan0", False)
+    down = process("run", unit("vcan0"))
+    assert down.wait(START_S) == 2
+    assert down.err == ["ucs: bus implement: the interface vcan0 is down; bring it up: ip link set vcan0 up"]
