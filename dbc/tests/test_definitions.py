@@ -137,7 +137,7 @@ def test_only_what_must_come_from_one_device_names_a_source() -> None:
     named = {message.name: message.source for message in CATALOG.messages.values()
              if message.source is not None and (message.name == "UCS_HEALTH" or not message.sent_by_ucs)}
     assert named == {"ETC2": 0x03, "DM1_ENGINE": 0x00, "DM1_TRANSMISSION": 0x03, "DM1_TRANSMISSION_2": 0x06,
-                     "DM1_TRACTOR_ECU": 0x47}
+                     "DM1_TRACTOR_ECU": 0x47, "UCS_HEALTH": 0x80}
 
 
 def test_sections_of_process_data_count_from_the_lowest_bits() -> None:
