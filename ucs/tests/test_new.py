@@ -35,10 +35,11 @@ def test_an_existing_file_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFi
 def meaning(catalog: Catalog) -> object:
     """A catalog without the places in files where it was defined."""
     return (
-        {name: (m.can_id, m.extended, m.length, sorted(m.signals, key=lambda s: s.name), set(m.senders), m.cycle_ns, m.pgn, m.source, m.monitor_as)
+        {name: (m.can_id, m.extended, m.length, sorted(m.signals, key=lambda s: s.name), set(m.senders), m.cycle_ns, m.pgn,
+                m.source, m.monitor_as)
          for name, m in catalog.messages.items()},
-        {name: (a.message, a.code, a.priority, a.when, a.until, a.enabled, a.on_delay_ns, a.off_delay_ns, a.latch, a.cause,
-                a.consequence, a.action, a.spn, a.fmi, a.repair) for name, a in catalog.alarms.items()},
+        {name: (a.message, a.code, a.priority, a.when, a.until, a.enabled, a.on_delay_ns, a.off_delay_ns, a.latch,
+                a.cause, a.consequence, a.action, a.spn, a.fmi, a.repair) for name, a in catalog.alarms.items()},
         catalog.commands)
 
 
