@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import os
 import resource
+import signal
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,10 +34,12 @@ _AT = "at "
 
 
 class _Request(msgspec.Struct, frozen=True):
-    """Files as (name in messages, path), and the buses of those that are bound."""
+    """Paths of the files, the buses of those that are bound, and the bounds of the child."""
 
-    files: tuple[tuple[str, str], ...]
-    bindings: dict[str, tuple[int, ...]] = {}
+    files: tuple[str, ...]
+    bindings: dict[str, tuple[int, ...]]
+    memory: int
+    cpu_s: int
 
 
 class Examination(msgspec.Struct, frozen=True):
@@ -74,8 +77,9 @@ def examine(files: Sequence[str | Path], bus_files: Mapping[int, Sequence[str | 
     if not found:
         missing = Problem("ucs", 0, "", "", 0, "error", "no DBC file is given", "name at least one")
         return Examination(None, tuple(problems) or (missing,))
-    answer = _ask(_Request(tuple((path, path) for path in found.values()), _bindings(found, bus_files or {})))
-    return _with(answer, problems)
+    paths = tuple(found.values())
+    request = _Request(paths, _bindings(found, bus_files or {}), MEMORY_LIMIT, _cpu_limit_s(paths))
+    return _with(_ask(request), problems)
 
 
 def _with(found: Examination, problems: Sequence[Problem]) -> Examination:
@@ -124,17 +128,16 @@ def _bindings(found: Mapping[str, str], bus_files: Mapping[int, Sequence[str | P
 def _ask(request: _Request) -> Examination:
     """Lets a child do the work."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
-    limit_s = _cpu_limit_s(path for _, path in request.files)
     try:
         child = subprocess.run([sys.executable, "-m", "level1.io.definitions"], input=msgspec.msgpack.encode(request),
-                               capture_output=True, env=environment, timeout=WALL_FACTOR * limit_s, check=False)
+                               capture_output=True, env=environment, timeout=WALL_FACTOR * request.cpu_s, check=False)
     except subprocess.TimeoutExpired as error:
         return _failed(error.stderr or b"", f"takes more than {error.timeout:.0f} s to read")
     if child.returncode == 0:
         return msgspec.msgpack.decode(child.stdout, type=Examination)
-    reasons = {_OUT_OF_MEMORY: f"takes more than {MEMORY_LIMIT // 1_000_000} MB of memory to read",
-               -24: f"takes more than {limit_s} s of computing time to read",
-               -9: f"takes more than {limit_s} s of computing time to read"}
+    too_long = f"takes more than {request.cpu_s} s of computing time to read"
+    reasons = {_OUT_OF_MEMORY: f"takes more than {request.memory // 1_000_000} MB of memory to read",
+               -signal.SIGXCPU: too_long, -signal.SIGKILL: too_long}
     return _failed(child.stderr, reasons.get(child.returncode, f"broke the DBC reader (exit code {child.returncode})"))
 
 
@@ -155,23 +158,22 @@ def _work(request: _Request) -> Examination:
     from level1 import definitions
     files = []
     problems: list[Problem] = []
-    for label, path in request.files:
-        print(f"{_AT}{label}", file=sys.stderr, flush=True)
+    for path in request.files:
+        print(f"{_AT}{path}", file=sys.stderr, flush=True)
         size = os.path.getsize(path)
         if size > MAX_FILE_BYTES:
-            problems.append(Problem(label, 0, "", "", 0, "error", f"has {size} bytes: too large for a DBC file",
+            problems.append(Problem(path, 0, "", "", 0, "error", f"has {size} bytes: too large for a DBC file",
                                     f"at most {MAX_FILE_BYTES} are read"))
             continue
-        files.append(definitions.read(definitions.Source(label, definitions.decode(Path(path).read_bytes()))))
+        files.append(definitions.read(definitions.Source(path, definitions.decode(Path(path).read_bytes()))))
     return _with(Examination(*definitions.assemble(files, request.bindings)), problems)
 
 
 def _main() -> int:
     """The child: limits itself, then works."""
     request = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=_Request)
-    limit_s = _cpu_limit_s(path for _, path in request.files)
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT, MEMORY_LIMIT))
-    resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s + 1))
+    resource.setrlimit(resource.RLIMIT_AS, (request.memory, request.memory))
+    resource.setrlimit(resource.RLIMIT_CPU, (request.cpu_s, request.cpu_s + 1))
     gc.disable()  # the child is short-lived; looking for cycles among millions of tokens costs a third of its time
     try:
         sys.stdout.buffer.write(msgspec.msgpack.encode(_work(request)))
