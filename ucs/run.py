@@ -5,7 +5,7 @@ import signal
 import sys
 import time
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from level1.io.inbox import Inbox
 from level1.io.journal import Journal
 from level1.io.live import Live, decode_state
 from level1.supervisor import State, Supervisor
+from ucs.printer import Printer
 from ucs.render import clock, event_line, painted, wants_colour
 from ucs.uplink import Uplink
 
@@ -47,6 +48,7 @@ def run(args: Namespace) -> int:
     if settings.journal is None:
         raise config.ConfigError(f'{settings.path}: journal: missing; add [journal] with path = "journal.db"')
     with ExitStack() as stack:
+        printer = stack.enter_context(Printer())
         inbox = Inbox()
         ports = [Port(index, bus, inbox, time.monotonic_ns, time.time_ns) for index, bus in enumerate(settings.bus)]
         for port in ports:
@@ -55,12 +57,12 @@ def run(args: Namespace) -> int:
         journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name))
         uplink = stack.enter_context(Uplink(journal, inbox, time.monotonic_ns))
         live = Live(_supervisor(settings, catalog, journal), journal, ports, inbox, clock=time.monotonic_ns,
-                    wall=time.time_ns, told=_told, notice=_notice, link=uplink)
+                    wall=time.time_ns, told=_teller(printer), notice=lambda text: printer.err(f"ucs: {text}"), link=uplink)
+        stack.callback(lambda: printer.out("\n".join(_end_lines(live, ports))))
         with _ended_by_signals(live):
-            print(*_start_lines(settings, catalog), f"boot {journal.boot}, journal {settings.journal.path}; supervising",
-                  sep="\n", flush=True)
+            printer.out("\n".join(_start_lines(settings, catalog)))
+            printer.out(f"boot {journal.boot}, journal {settings.journal.path}; supervising")
             live.run()
-    print(*_end_lines(live, ports), sep="\n", flush=True)
     return 0
 
 
@@ -82,13 +84,10 @@ def _restored(journal: Journal) -> State | None:
                            "out, then set another [journal] path") from None
 
 
-def _told(event: Event) -> None:
-    """A line for an event; someone may be reading a pipe."""
-    print(event_line(event, clock(event), wants_colour(sys.stdout)), flush=True)
-
-
-def _notice(text: str) -> None:
-    print(f"ucs: {text}", file=sys.stderr, flush=True)
+def _teller(printer: Printer) -> Callable[[Event], None]:
+    """Prints a line for each event."""
+    colour = wants_colour(sys.stdout)
+    return lambda event: printer.out(event_line(event, clock(event), colour))
 
 
 @contextmanager
@@ -118,7 +117,7 @@ def _start_lines(settings: Config, catalog: Catalog) -> Iterator[str]:
 
 def _end_lines(live: Live, ports: list[Port]) -> Iterator[str]:
     """What became of the frames."""
-    yield "stopped; the journal is closed"
+    yield "stopped"
     for port in ports:
         counts = ", ".join(f"{count} {word}" for word, count in sorted(port.counters.items()))
         yield f"  bus {port.settings.name}: {counts or 'no frame sent'}"

