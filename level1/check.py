@@ -4,7 +4,8 @@ What stands wrong at one place of a text, `level1.resolver` tells with its colum
 """
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -93,6 +94,34 @@ def _budget(repair: Repair) -> Iterator[Doubt]:
     elif together > repair.window_ns:
         yield Doubt("RepairWindow", "warning", f"{repair.attempts} attempts can take {_s(together)}, the window is "
                     f"{_s(repair.window_ns)}: it may never give up", "make the window longer")
+
+
+def circles(alarms: Iterable[Alarm]) -> Iterator[tuple[Alarm, tuple[str, ...]]]:
+    """Alarms whose conditions ask, in the end, for their own state, each circle once: they would never come to rest."""
+    by_name = {alarm.name: alarm for alarm in alarms}
+    asks = {name: sorted({asked for condition in (alarm.when, alarm.until, alarm.enabled) if condition
+                          for asked in reach.states(condition) if asked in by_name}) for name, alarm in by_name.items()}
+    told: set[str] = set()
+    for name in by_name:
+        path = _way_back(name, asks)
+        if path and not told & set(path):
+            told |= set(path)
+            yield by_name[name], (*path, name)
+
+
+def _way_back(name: str, asks: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """The shortest chain of questions that begins at an alarm and would lead back to it, () when there is none."""
+    ways: deque[tuple[str, ...]] = deque([(name,)])
+    seen: set[str] = set()
+    while ways:
+        way = ways.popleft()
+        for asked in asks[way[-1]]:
+            if asked == name:
+                return way
+            if asked not in seen:
+                seen.add(asked)
+                ways.append((*way, asked))
+    return ()
 
 
 def least_ns(steps: Iterable[Step]) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 
@@ -34,7 +34,8 @@ _BODIES: Mapping[str, re.Pattern[str]] = {
         rf"\s*\[\s*(?P<minimum>{_NUMBER})\s*\|\s*(?P<maximum>{_NUMBER})\s*\]"),
     "BA_": re.compile(rf'BA_\s+"(?P<name>[^"]*)"\s*{_OBJECT}(?P<value>{STRING}|{_NUMBER})\s*;', re.DOTALL),
     "BA_DEF_": re.compile(
-        r'BA_DEF_\s+(?:(?P<kind>SG_|BO_|BU_|EV_)\s+)?"(?P<name>[^"]*)"\s*(?P<type>\w+)'),
+        r'BA_DEF_\s+(?:(?P<kind>SG_|BO_|BU_|EV_)\s+)?"(?P<name>[^"]*)"\s*(?P<type>\w+)'
+        rf"(?P<words>(?:\s*,?\s*{STRING})*+)", re.DOTALL),
     "BA_DEF_DEF_": re.compile(rf'BA_DEF_DEF_\s+"(?P<name>[^"]*)"\s*(?P<value>{STRING}|{_NUMBER})\s*;', re.DOTALL),
     "VAL_": re.compile(rf"VAL_\s+(?P<id>{_INT})\s+(?P<name>\w+)(?P<rest>(?:\s*{_NUMBER}\s*{STRING})*+)\s*;", re.DOTALL),
     "SIG_VALTYPE_": re.compile(rf"SIG_VALTYPE_\s+(?P<id>{_INT})\s+(?P<name>\w+)\s*:\s*(?P<type>{_INT})\s*;"),
@@ -84,10 +85,14 @@ class MessageText:
 
 @dataclass(frozen=True, slots=True)
 class AttributeText:
-    """A `BA_` line. kind: `SG_`, `BO_`, `BU_`, `EV_` or "" (the network). object: id or node name; value: as written."""
+    """A `BA_` line, or a `BA_DEF_DEF_` line without object. kind: `SG_`, `BO_`, `BU_`, `EV_` or "" (the network).
+
+    object: id or node name. value, value_span: as written, and where.
+    """
 
     line: int
     span: tuple[int, int]
+    value_span: tuple[int, int]
     name: str
     kind: str
     object: str
@@ -97,12 +102,13 @@ class AttributeText:
 
 @dataclass(frozen=True, slots=True)
 class DefinitionText:
-    """A `BA_DEF_` line."""
+    """A `BA_DEF_` line; words: of an enumeration."""
 
     line: int
     name: str
     kind: str
     type: str
+    words: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +133,7 @@ class DbcText:
         self.messages: list[MessageText] = []
         self.attributes: list[AttributeText] = []
         self.definitions: dict[str, DefinitionText] = {}
+        self.defaults: list[AttributeText] = []
         self.entries: list[EntryText] = []
         self.malformed: list[tuple[int, str]] = []
         self._newlines = [match.start() for match in re.finditer("\n", text)]
@@ -146,14 +153,15 @@ class DbcText:
         kind = "SG_" if signal else "BO_"
         return self._attribute_lines.get((kind, str(message_id), signal, name), 0)
 
-    def without(self, spans: Iterable[tuple[int, int]]) -> str:
-        """The text with some statements blanked out, every line where it was."""
+    def changed(self, changes: Mapping[tuple[int, int], str]) -> str:
+        """The text with other text in some places, each padded with blanks to its old length: every line where it was."""
         parts: list[str] = []
         position = 0
-        for start, end in sorted(set(spans)):
-            parts.append(self.text[position:start])
-            parts.append(re.sub(r"[^\n]", " ", self.text[start:end]))
-            position = end
+        for (start, end), new in sorted(changes.items()):
+            if start >= position:
+                parts.append(self.text[position:start])
+                parts.append(new + re.sub(r"[^\n]", " ", self.text[start + len(new):end]))
+                position = end
         return "".join([*parts, self.text[position:]])
 
     def _add(self, word: str, match: re.Match[str]) -> None:
@@ -168,9 +176,13 @@ class DbcText:
                     group("offset"), group("minimum"), group("maximum")))
         elif word == "BA_":
             self.attributes.append(AttributeText(
-                line, span, group("name"), group("kind") or "", group("object") or "", group("signal") or "", group("value")))
+                line, span, match.span("value"), group("name"), group("kind") or "", group("object") or "",
+                group("signal") or "", group("value")))
         elif word == "BA_DEF_":
-            self.definitions[group("name")] = DefinitionText(line, group("name"), group("kind") or "", group("type"))
+            words = tuple(word[1:-1] for word in re.findall(STRING, group("words"), re.DOTALL))
+            self.definitions[group("name")] = DefinitionText(line, group("name"), group("kind") or "", group("type"), words)
+        elif word == "BA_DEF_DEF_":
+            self.defaults.append(AttributeText(line, span, match.span("value"), group("name"), "", "", "", group("value")))
         elif word == "SG_MUL_VAL_":
             self.entries.append(EntryText(line, span, word, int(group("id")), group("name"), group(), _ranges(group("ranges")),
                                           group("multiplexer")))

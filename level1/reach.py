@@ -286,6 +286,21 @@ def inputs(node: Expression) -> Iterator[tuple[str, str]]:
             yield node.message, node.signal
 
 
+def states(node: Expression) -> Iterator[str]:
+    """Alarms whose state a condition asks for."""
+    match node:
+        case And(items=parts) | Or(items=parts) | Function(arguments=parts):
+            for part in parts:
+                yield from states(part)
+        case Not(item=item):
+            yield from states(item)
+        case Compare(left=left, right=right) | Arithmetic(left=left, right=right):
+            yield from states(left)
+            yield from states(right)
+        case AlarmState(alarm=alarm):
+            yield alarm
+
+
 # -- arithmetic of intervals --------------------------------------------------------------------------------------------
 
 

@@ -7,6 +7,7 @@ one, which reads the attributes of DESIGN §3 and puts the catalog together.
 from __future__ import annotations
 
 import codecs
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -33,6 +34,8 @@ ALARM_BITS = 2
 """Bits an alarm's signal needs for its four states (DESIGN §3)."""
 OWN_COMMANDS = ("acknowledge", "reset")
 """Commands the core itself answers; a DBC can't define them."""
+_TOPIC_LEVEL = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+"""A name that can be a level of an MQTT topic (DESIGN §6)."""
 MAX_FINDINGS = 10
 """Mistakes told of one text."""
 
@@ -85,6 +88,7 @@ ATTRIBUTES: Mapping[str, AttributeSpec] = {
     "Commands": AttributeSpec("BO_", ("STRING",)),
 }
 """Every attribute of the alarm language (DESIGN §3), besides Vector's own."""
+_KINDS = {"SG_": "signals", "BO_": "messages"}
 
 
 class Assembly(NamedTuple):
@@ -216,6 +220,7 @@ class _Builder:
         """The catalog, as far as it could be built."""
         for file in self._files:
             self._check_definitions(file)
+            self._check_objects(file)
         messages = self._messages()
         self._check_ids(messages)
         places = [(message, signal, self._place(file, message, signal)) for file, message in messages
@@ -227,6 +232,9 @@ class _Builder:
         self._check_codes(alarm_places)
         for alarm in alarms:
             self._take_doubts(alarm, scope.messages)
+        for alarm, circle in check.circles(alarms):
+            self._place_of(alarm).note("AlarmWhen", f"it depends on its own state: {' -> '.join(circle)}",
+                                       "take one of the states out of it")
         return Catalog(
             files=tuple(file.path for file in self._files),
             messages={message.name: message for _, message in messages},
@@ -250,10 +258,35 @@ class _Builder:
                 self.problems.append(Problem(file.path, definition.line, "", "", 0, "warning",
                                              f'attribute "{name}" means nothing here', f"did you mean `{near}`?"))
 
+    def _check_objects(self, file: DbcFile) -> None:
+        """Attributes of the alarm language that cantools would pass over in silence: on nothing, on a wrong object, twice."""
+        signals = {str(message.id): (message.name, {signal.name for signal in message.signals}) for message in file.text.messages}
+        lines: dict[tuple[str, str, str], int] = {}
+        for given in file.text.attributes:
+            spec = ATTRIBUTES.get(given.name)
+            if spec is None:
+                continue
+            message, names = signals.get(given.object, (given.object, set()))
+            where = ".".join(part for part in (message, given.signal) if part)
+            first = lines.setdefault((given.name, given.object, given.signal), given.line)
+            if given.kind != spec.kind:
+                problem = "error", f"belongs to {_KINDS[spec.kind]}", f"write {spec.kind}, an identifier" + " and a signal" * (
+                    spec.kind == "SG_")
+            elif given.object not in signals:
+                problem = "error", f"there is no message with the identifier {given.object}", similar.hint(given.object, signals)
+            elif given.kind == "SG_" and given.signal not in names:
+                problem = "error", f"message {message} has no signal `{given.signal}`", similar.hint(given.signal, names)
+            elif first != given.line:
+                problem = "warning", f"is set twice, first in line {first}: the last one counts", "remove one of them"
+            else:
+                continue
+            severity, text, hint = problem
+            self.problems.append(Problem(file.path, given.line, where, given.name, 0, severity, text, hint))
+
     def _definition_problem(self, file: DbcFile, line: int, name: str, spec: AttributeSpec) -> None:
-        kind = {"SG_": "signals", "BO_": "messages"}[spec.kind]
         words = " " + ",".join(f'"{word}"' for word in spec.words) if spec.words else ""
-        self.problems.append(Problem(file.path, line, "", "", 0, "error", f"{name} belongs to {kind} and is {spec.types[0]}",
+        text = f"{name} belongs to {_KINDS[spec.kind]} and is {spec.types[0]}"
+        self.problems.append(Problem(file.path, line, "", "", 0, "error", text,
                                      f'write `BA_DEF_ {spec.kind} "{name}" {spec.types[0]}{words} ;`'))
 
     def _messages(self) -> list[tuple[DbcFile, Message]]:
@@ -276,7 +309,11 @@ class _Builder:
             for signal in bearers[1:]:
                 self._place(file, message, signal).note("Role", f"{message.name} has a {role.lower()} already: {bearers[0].name}",
                                                         "a message has one of each at the most")
-        return msgspec.structs.replace(message, signals=signals, monitor_as=self._place(file, message).text("MonitorAs"))
+        monitor_as = self._place(file, message).text("MonitorAs")
+        if monitor_as and not _TOPIC_LEVEL.fullmatch(monitor_as):
+            self._place(file, message).note("MonitorAs", f"`{monitor_as}` can't be the name of a monitoring message",
+                                            "letters, digits, - and _, beginning with a letter")
+        return msgspec.structs.replace(message, signals=signals, monitor_as=monitor_as)
 
     def _with_role(self, signal: Signal, place: _Place) -> Signal:
         if not place.given("Role"):
@@ -342,6 +379,9 @@ class _Builder:
         fmi = place.number("AlarmFmi", -1, 0, resolver.MAX_FMI) if place.given("AlarmFmi") else -1
         numbers = self._numbers(place)
         repair = self._repair(place, scope)
+        if place.given("AlarmSpn") != place.given("AlarmFmi"):
+            place.note("AlarmSpn" if place.given("AlarmSpn") else "AlarmFmi", "a trouble code needs both AlarmSpn and AlarmFmi",
+                       "give the other one as well", "warning")
         if when is None:
             return None
         return Alarm(

@@ -19,7 +19,16 @@ from textparser import ParseError
 
 from level1 import dbc_text, similar
 from level1.catalog import Message, Problem, Signal
-from level1.dbc_text import EXTENDED_ID, UNUSED_MESSAGE, DbcText, EntryText, MessageText, SignalText
+from level1.dbc_text import (
+    EXTENDED_ID,
+    UNUSED_MESSAGE,
+    AttributeText,
+    DbcText,
+    DefinitionText,
+    EntryText,
+    MessageText,
+    SignalText,
+)
 from level1.decode import raw_range
 from level1.definitions import limits
 from level1.frame import j1939_pgn
@@ -77,7 +86,7 @@ class _Reader:
         self._path = path
         self._text = text
         self._problems: list[Problem] = []
-        self._blanked: list[tuple[int, int]] = []
+        self._changes: dict[tuple[int, int], str] = {}
 
     def read(self) -> DbcFile:
         if oversize := list(limits.violations(self._text)):
@@ -86,7 +95,7 @@ class _Reader:
             return DbcFile(self._path, self._text, (), {}, tuple(self._problems), {})
         self._find_malformed()
         self._find_duplicates()
-        self._find_undefined_attributes()
+        self._check_attributes()
         self._find_stray_entries()
         database = None if self._text.malformed else self._parse()
         pairs = list(self._pairs(database)) if database else []
@@ -124,7 +133,7 @@ class _Reader:
     def _duplicate(self, message: MessageText, text: str) -> None:
         self._problem(message.line, text, where=message.name)
         end = max([message.span[1], *(signal.span[1] for signal in message.signals)])
-        self._blanked.append((message.span[0], self._statement_end(end)))
+        self._changes[message.span[0], self._statement_end(end)] = ""
 
     def _find_duplicate_signals(self, message: MessageText) -> None:
         lines: dict[str, int] = {}
@@ -134,14 +143,51 @@ class _Reader:
                               where=f"{message.name}.{signal.name}")
             lines.setdefault(signal.name, signal.line)
 
-    def _find_undefined_attributes(self) -> None:
-        unknown = [a for a in self._text.attributes if a.name not in self._text.definitions]
-        for attribute in unknown:
-            self._blanked.append(attribute.span)
-            kind = f"{attribute.kind} " if attribute.kind else ""
-            self._problem(attribute.line, f'attribute "{attribute.name}" is not defined in this file',
-                          similar.hint(attribute.name, self._text.definitions)
-                          or f'add a line like `BA_DEF_ {kind}"{attribute.name}" STRING ;`')
+    def _check_attributes(self) -> None:
+        for attribute in [*self._text.attributes, *self._text.defaults]:
+            definition = self._text.definitions.get(attribute.name)
+            if definition is None:
+                self._undefined(attribute)
+            elif definition.type in ("INT", "HEX", "FLOAT"):
+                self._check_number(attribute, definition)
+        for attribute in self._text.attributes:
+            definition = self._text.definitions.get(attribute.name)
+            if definition and definition.type == "ENUM":
+                self._check_word(attribute, definition)
+
+    def _undefined(self, attribute: AttributeText) -> None:
+        self._changes[attribute.span] = ""
+        kind = f"{attribute.kind} " if attribute.kind else ""
+        self._problem(attribute.line, f'attribute "{attribute.name}" is not defined in this file',
+                      similar.hint(attribute.name, self._text.definitions)
+                      or f'add a line like `BA_DEF_ {kind}"{attribute.name}" STRING ;`')
+
+    def _check_word(self, attribute: AttributeText, definition: DefinitionText) -> None:
+        """Some write the word of an enumeration where the format wants its number; both are understood."""
+        value = attribute.value
+        if value.startswith('"'):
+            if value[1:-1] in definition.words:
+                self._changes[attribute.value_span] = str(definition.words.index(value[1:-1]))
+                return
+            hint = similar.hint(value[1:-1], definition.words)
+        elif re.fullmatch(r"\d{1,4}", value) and int(value) < len(definition.words):
+            return
+        else:
+            hint = f"0 to {len(definition.words) - 1}"
+        self._changes[attribute.span] = ""
+        self._problem(attribute.line, f"{value} is no value of it", f"{hint} its values are {', '.join(definition.words)}".strip(),
+                      where=self._owner(attribute), attribute=attribute.name)
+
+    def _check_number(self, attribute: AttributeText, definition: DefinitionText) -> None:
+        if attribute.value.startswith('"') and not re.fullmatch(r'"[-+]?\d{1,40}(?:\.\d{1,40})?"', attribute.value):
+            self._changes[attribute.span] = ""
+            if attribute.value != '""':
+                self._problem(attribute.line, f"{attribute.value[:40]} is no number", "write a number without quotes",
+                              where=self._owner(attribute), attribute=attribute.name)
+
+    def _owner(self, attribute: AttributeText) -> str:
+        message = next((message.name for message in self._text.messages if str(message.id) == attribute.object), attribute.object)
+        return ".".join(part for part in (message, attribute.signal) if part)
 
     def _find_stray_entries(self) -> None:
         signals = {m.id: {s.name: s for s in m.signals} for m in self._text.messages}
@@ -155,7 +201,7 @@ class _Reader:
             seen.add(key)
 
     def _stray(self, entry: EntryText, message: str) -> None:
-        self._blanked.append(entry.span)
+        self._changes[entry.span] = ""
         self._problem(entry.line, message, severity="warning")
 
     def _statement_end(self, position: int) -> int:
@@ -167,7 +213,7 @@ class _Reader:
     def _parse(self) -> cantools.database.can.Database | None:
         database = cantools.database.can.Database(strict=False, sort_signals=None)
         try:
-            database.add_dbc_string(self._text.without(self._blanked) + _END)
+            database.add_dbc_string(self._text.changed(self._changes) + _END)
         except ParseError as error:
             self._problem(*self._syntax_error(error))
         except CantoolsError as error:
@@ -225,7 +271,8 @@ class _Reader:
             self._problem(text.line, "VFrameFormat says J1939, but the identifier has 11 bits: matched by identifier",
                           where=parsed.name, attribute="VFrameFormat", severity="warning")
         source = parsed.frame_id & 0xFF
-        signals = tuple(self._signal(parsed, *pair) for pair in zip(parsed.signals, text.signals, strict=True))
+        long_names = {line.name: signal.name for signal, line in zip(parsed.signals, text.signals, strict=True)}
+        signals = tuple(self._signal(parsed, *pair, long_names) for pair in zip(parsed.signals, text.signals, strict=True))
         self._find_overlaps(parsed, text, signals)
         return Message(
             name=parsed.name, can_id=parsed.frame_id, extended=parsed.is_extended_frame, length=parsed.length, signals=signals,
@@ -244,7 +291,7 @@ class _Reader:
                       attribute="GenMsgCycleTime", severity="warning")
         return None
 
-    def _signal(self, message: DbcMessage, parsed: DbcSignal, text: SignalText) -> Signal:
+    def _signal(self, message: DbcMessage, parsed: DbcSignal, text: SignalText, long_names: Mapping[str, str]) -> Signal:
         where = f"{message.name}.{parsed.name}"
         factor, offset = dbc_text.decimal(text.factor), dbc_text.decimal(text.offset)
         is_float = bool(parsed.conversion.is_float)
@@ -263,7 +310,7 @@ class _Reader:
             signed=parsed.is_signed, is_float=is_float, factor=factor or Decimal(1), offset=offset, minimum=minimum,
             maximum=maximum, unit=parsed.unit or "",
             choices={int(raw): str(name) for raw, name in (parsed.choices or {}).items()},
-            is_multiplexer=bool(parsed.is_multiplexer), multiplexer_signal=parsed.multiplexer_signal,
+            is_multiplexer=bool(parsed.is_multiplexer), multiplexer_signal=long_names.get(parsed.multiplexer_signal or ""),
             multiplexer_ids=None if parsed.multiplexer_ids is None else tuple(sorted(parsed.multiplexer_ids)),
             comment=parsed.comment or "")
         return msgspec.structs.replace(signal, initial_raw=self._initial_raw(where, signal, parsed.raw_initial, text.line))
@@ -318,20 +365,17 @@ class _Reader:
             default = definition.default_value
             if name in own:
                 line = self._text.attribute_line(name, identifier, signal)
-                value = self._word(definition, own[name].value, line)
+                value = _word(definition, own[name].value)
                 values[name] = Attribute(value, line, value != default and value != "")
             elif default is not None:
                 values[name] = Attribute(default, 0, False)
         return values
 
-    def _word(self, definition: Any, value: Any, line: int) -> str | int | float:
-        if definition.type_name != "ENUM":
-            return value if isinstance(value, str | int | float) else str(value)
-        if 0 <= int(value) < len(definition.choices):
-            return str(definition.choices[int(value)])
-        self._problem(line, f"{value} is no value of the enumeration", f"0 to {len(definition.choices) - 1}",
-                      attribute=definition.name)
-        return ""
+
+def _word(definition: Any, value: Any) -> str | int | float:
+    if definition.type_name == "ENUM":
+        return str(definition.choices[int(value)])  # `_check_word` has seen to it that there is one
+    return value if isinstance(value, str | int | float) else str(value)
 
 
 def _lines(parsed: DbcMessage, text: MessageText) -> Iterator[tuple[Owner, int]]:
