@@ -335,8 +335,15 @@ def _ignore(t_ns: int, data: bytes) -> None:
     return None
 
 
+def _as_it_is(page: Page) -> None:
+    """Every frame has been received: there is nothing to bring up to date."""
+
+
 class Board:
-    """All cells and pages, and the evaluation of what they move. Built by `condition`, driven by `supervisor`."""
+    """All cells and pages, and the evaluation of what they move. Built by `condition`, driven by `supervisor`.
+
+    refresh(page): called before a page is looked at outside of conditions; over recordings, `sieve` then brings it up to date.
+    """
 
     def __init__(self, catalog: Catalog, timers: Timers):
         self.catalog = catalog
@@ -349,6 +356,7 @@ class Board:
         self.listeners: dict[int, Callable[[int, int, bytes], None]] = {}
         self.queued: list[Watch] = []
         self.watches = 0
+        self.refresh: Callable[[Page], None] = _as_it_is
         self._by_key: dict[int, list[str]] = {}
         self._by_pgn: dict[tuple[int, int], list[tuple[int | None, str]]] = {}
 
@@ -521,29 +529,53 @@ class Board:
 
     def touch(self, cell: Cell, raw: RawValue, t_ns: int) -> None:
         """A signal has left its class (or, exact, its value; or every frame counts)."""
-        if cell.signal.is_float:
-            quality = float_quality(cell.signal, float(raw))
-            k = 0 if quality == GOOD else 1
-        else:
-            classes = cell.classes
-            k = bisect_right(classes.cuts, raw)
-            quality = classes.quality[k]
         if not cell.exact:
-            cell.lo, cell.hi = classes.low[k], classes.high[k]
+            self._classify(cell, raw)
         else:
             changed = cell.raw != raw or cell.k >= cell.base
-            cell.lo = cell.hi = cell.raw = raw
-            cell.bad = BAD[quality]
-            cell.value = cell.scale.physical(raw) if quality == GOOD else 0
+            self._take_value(cell, raw, self._classify(cell, raw))
             if changed and cell.held is not None:
                 cell.held.restart(t_ns, cell.bad)
             if cell.rate is not None:
                 cell.rate.sample(t_ns, cell.value, cell.bad)
-        cell.k = k
         for watch in cell.watches:
             if not watch.queued:
                 watch.queued = True
                 self.queued.append(watch)
+
+    def place(self, page: Page, t_ns: int, data: bytes) -> None:
+        """Bring a page up to a frame that changes nothing for anyone: neither conditions nor clocks are told."""
+        page.t_ns = t_ns
+        page.data = data
+        page.seen = ALWAYS if page.always else data
+        for cell in page.cells:
+            raw = raw_of(cell.signal, data)
+            if raw is None:
+                cell.k = cell.base + SHORT
+                cell.lo, cell.hi, cell.raw = 1, 0, None
+                cell.bad = BAD[SHORT]
+                continue
+            quality = self._classify(cell, raw)
+            if cell.exact:
+                self._take_value(cell, raw, quality)
+
+    def _classify(self, cell: Cell, raw: RawValue) -> int:
+        """Put a cell into the class of a raw value, and give its quality."""
+        if cell.signal.is_float:
+            quality = float_quality(cell.signal, float(raw))
+            cell.k = 0 if quality == GOOD else 1
+            return quality
+        classes = cell.classes
+        k = cell.k = bisect_right(classes.cuts, raw)
+        if not cell.exact:
+            cell.lo, cell.hi = classes.low[k], classes.high[k]
+        return classes.quality[k]
+
+    @staticmethod
+    def _take_value(cell: Cell, raw: RawValue, quality: int) -> None:
+        cell.lo = cell.hi = cell.raw = raw
+        cell.bad = BAD[quality]
+        cell.value = cell.scale.physical(raw) if quality == GOOD else 0
 
     def spoil(self, cell: Cell, quality: int) -> None:
         """A signal has no raw value any more: NEVER, OLD, SHORT, CORRUPT or FROZEN."""
@@ -609,6 +641,7 @@ class Board:
     def sample(self, cell: Cell) -> tuple[RawValue | None, int]:
         """Raw value (None where there is none) and quality of a signal, from the last payload. For events and monitoring."""
         page = cell.page
+        self.refresh(page)
         if page.level < 0:
             return None, NEVER
         return raw_of(cell.signal, page.data), cell.quality

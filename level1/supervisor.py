@@ -398,7 +398,7 @@ class Supervisor:
                     cell = self.board.cell(message, signal)
                     inputs[cell.name] = _reader(self.board, cell)
                 case Silent(message=message) | Quality(message=message) | Elapsed(message=message):
-                    inputs[message] = _silence(self.board.page(message))
+                    inputs[message] = _silence(self.board, self.board.page(message))
                 case AlarmState(alarm=other):
                     inputs[other] = _state_word(self._alarms[other])
                 case Count(alarm=other, window_ns=window):
@@ -769,8 +769,9 @@ def _reader(board: Board, cell: Cell) -> Callable[[int], Any]:
     return read
 
 
-def _silence(page: Page) -> Callable[[int], Any]:
+def _silence(board: Board, page: Page) -> Callable[[int], Any]:
     def read(t_ns: int) -> Any:
+        board.refresh(page)
         return "never" if page.level < 0 else f"last received {(t_ns - page.t_ns) / 1e9:.3f} s ago"
     return read
 
