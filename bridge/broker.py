@@ -7,14 +7,17 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
-import socket
+import os
 import threading
 import warnings
+from contextlib import suppress
 from typing import Any
 
 from bridge.mqtt import Address, MqttError
 
 START_S = 10.0
+SHUTDOWN_S = 1.0
+"""Patience with amqtt's own ending, which now and then never comes (it loses a cancellation of its reader)."""
 
 
 class EmbeddedBroker:
@@ -24,16 +27,20 @@ class EmbeddedBroker:
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0):
-        self.address = Address(host, _checked_port(host, port), False)
-        self._loop = asyncio.new_event_loop()
-        self._loop.set_exception_handler(lambda loop, context: None)  # a client's broken connection is no news
+        if not is_loopback(host):
+            raise MqttError(f'broker "{host}": the embedded broker knows no users and no TLS, so it listens on 127.0.0.1 only; '
+                            "run mosquitto for other machines (see `ucs bridge --help`)")
+        self.address = Address(host, port, False)
+        self._writers: set[asyncio.StreamWriter] = set()
         self._started = threading.Event()
         self._stop = asyncio.Event()
         self._failure = ""
+        self._loop = asyncio.new_event_loop()
+        self._loop.set_exception_handler(lambda loop, context: None)  # a client's broken connection is no news
         self._thread = threading.Thread(target=self._run, name="broker", daemon=True)
         self._thread.start()
         if not self._started.wait(START_S) or self._failure:
-            raise MqttError(f"broker {self.address}: can't start ({self._failure or 'no answer'}); choose another port")
+            raise MqttError(f"broker {host}:{port}: can't listen there ({self._failure or 'no answer'}); choose another port")
 
     def __enter__(self) -> EmbeddedBroker:
         return self
@@ -42,15 +49,17 @@ class EmbeddedBroker:
         self.close()
 
     def close(self) -> None:
-        """Stop it; retained messages go with it."""
-        if self._thread.is_alive():
+        """Stop it, without a word to its clients; retained messages go with it."""
+        with suppress(RuntimeError):  # stopped before
             self._loop.call_soon_threadsafe(self._stop.set)
-            self._thread.join(START_S)
+        self._thread.join()
 
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._serve())
+        except OSError as error:
+            self._failure = os.strerror(error.errno) if error.errno else str(error)
         except Exception as error:  # told by the constructor
             self._failure = str(error) or type(error).__name__
         finally:
@@ -59,20 +68,36 @@ class EmbeddedBroker:
             self._loop.close()
 
     async def _serve(self) -> None:
-        broker = _quiet_broker(self.address)
+        # the listening is ours: amqtt's own neither tells the port it took nor lets go of connections for certain
+        broker = _quiet_broker()
         await broker.start()
+        server = await asyncio.start_server(lambda reader, writer: self._accept(broker, reader, writer), *self.address[:2])
+        self.address = self.address._replace(port=server.sockets[0].getsockname()[1])
         self._started.set()
         await self._stop.wait()
-        await broker.shutdown()
+        server.close()
+        for writer in list(self._writers):
+            writer.transport.abort()
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(broker.shutdown(), SHUTDOWN_S)
+
+    async def _accept(self, broker: Any, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        from amqtt.adapters import StreamReaderAdapter, StreamWriterAdapter
+        self._writers.add(writer)
+        try:
+            await broker.external_connected(StreamReaderAdapter(reader), StreamWriterAdapter(writer), "default")
+        finally:
+            self._writers.discard(writer)
+            writer.close()
 
     def _end_tasks(self) -> None:
         tasks = asyncio.all_tasks(self._loop)
         for task in tasks:
             task.cancel()
-        self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
+        self._loop.run_until_complete(asyncio.wait(tasks, timeout=SHUTDOWN_S) if tasks else asyncio.sleep(0))
 
 
-def _quiet_broker(address: Address) -> Any:
+def _quiet_broker() -> Any:
     """amqtt's broker without its log lines, `$SYS` topics and plug-ins of other packages."""
     for name in ("amqtt", "transitions"):
         logging.getLogger(name).addHandler(logging.NullHandler())
@@ -82,24 +107,8 @@ def _quiet_broker(address: Address) -> Any:
         warnings.simplefilter("ignore")
         from amqtt.broker import Broker
         from amqtt.contexts import BrokerConfig, ListenerConfig, ListenerType
-        listener = ListenerConfig(type=ListenerType.TCP, bind=f"{address.host}:{address.port}", max_connections=0)
         anonymous = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
-        return Broker(BrokerConfig(listeners={"default": listener}, plugins=anonymous))
-
-
-def _checked_port(host: str, port: int) -> int:
-    """The port, a free one for 0. Raises MqttError where it is taken, or the host is not this machine alone."""
-    if not is_loopback(host):
-        raise MqttError(f"broker {host}: the embedded broker knows no users and no TLS, so it listens on 127.0.0.1 only; "
-                        "run mosquitto for other machines (see `ucs bridge --help`)")
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            raise MqttError(f"broker {host}:{port}: can't listen there ({error.strerror}); choose another port") from None
-        return int(probe.getsockname()[1])
+        return Broker(BrokerConfig(listeners={"default": ListenerConfig(type=ListenerType.EXTERNAL)}, plugins=anonymous))
 
 
 def is_loopback(host: str) -> bool:

@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import msgspec
 
@@ -24,8 +23,6 @@ from level1.event import Event, Monitor, Result
 
 DATAGRAM_BYTES = 100_000
 """A Unix datagram may have about 200 kB."""
-NEWEST = 200
-"""Events handed over beside the journal at a time."""
 RECEIVE = 100
 """Datagrams taken in one call."""
 
@@ -150,64 +147,6 @@ class RunLink(_End[FromBridge]):
     def answer(self, result: Result) -> bool:
         """Hand over the result of an order."""
         return self._send(Answer(result))
-
-    def publish(self, outputs: Sequence[Monitor | Result]) -> None:
-        """Hand over what the live loop gives upward; to be called at least once a second, with or without outputs."""
-        self.send_samples(*(output for output in outputs if isinstance(output, Monitor)))
-        for output in outputs:
-            if isinstance(output, Result):
-                self.answer(output)
-
-
-class Store(Protocol):
-    """What `LinkedJournal` needs of a journal."""
-
-    def append(self, events: Sequence[Event], state: bytes) -> bool:
-        """Write events and state; True when they are on the disk."""
-
-    @property
-    def fault(self) -> str | None:
-        """Why they are not."""
-
-    @property
-    def incidents(self) -> tuple[str, ...]:
-        """What befell the file."""
-
-    @property
-    def pending(self) -> tuple[Event, ...]:
-        """Events that are not on the disk."""
-
-
-class LinkedJournal:
-    """A journal whose news the bridge hears at once, and whose events leave by radio even while the disk takes nothing."""
-
-    def __init__(self, journal: Store, link: RunLink):
-        self._journal, self._link = journal, link
-
-    def append(self, events: Sequence[Event], state: bytes) -> bool:
-        """As the journal's; then the bridge is told."""
-        durable = self._journal.append(events, state)
-        if not durable:
-            self._link.send_beside(self._journal.pending[-NEWEST:])
-        elif events:
-            self._link.poke()
-        return durable
-
-    @property
-    def fault(self) -> str | None:
-        """The journal's."""
-        return self._journal.fault
-
-    @property
-    def incidents(self) -> tuple[str, ...]:
-        """The journal's."""
-        return self._journal.incidents
-
-    def publish(self, outputs: Sequence[Monitor | Result]) -> None:
-        """As `RunLink.publish`; what the disk doesn't take is handed over again, in case the bridge has just started."""
-        self._link.publish(outputs)
-        if pending := self._journal.pending:
-            self._link.send_beside(pending[-NEWEST:])
 
 
 class BridgeLink(_End[FromRun]):

@@ -25,6 +25,7 @@ KEEP_ALIVE_S = 5
 """A broken radio link is noticed after one and a half of it, by either side (MQTT 3.1.1 §3.1.2.10)."""
 CONNECT_S = 5.0
 """Patience with name look-up, TCP and TLS; then as much again with the broker's own answers."""
+GOODBYE_S = 1.0
 PACKET_BYTES = 1 << 20
 """A longer packet ends the connection before it is read: no payload of ours comes near it."""
 BLOCK_BYTES = 65_536
@@ -112,6 +113,7 @@ class MqttConnection:
         self.lost = ""
         self._subscribe = list(subscribe)
         self._received: list[Received] = []
+        self._last: paho.MQTTMessageInfo | None = None
         self._deadline = time.monotonic() + 2 * CONNECT_S
         self._client = _Client(CallbackAPIVersion.VERSION2, client_id, clean_session=True, protocol=paho.MQTTv311,
                                reconnect_on_failure=False)
@@ -156,7 +158,8 @@ class MqttConnection:
     def publish(self, topic: str, payload: bytes, qos: int = 0, retain: bool = False) -> None:
         """Send, or begin to; whether it arrived is told by an answer from level 2, by nothing else."""
         if not self.lost:
-            self._check(self._client.publish(topic, payload, qos, retain).rc)
+            self._last = self._client.publish(topic, payload, qos, retain)
+            self._check(self._last.rc)
 
     @property
     def congested(self) -> bool:
@@ -164,9 +167,9 @@ class MqttConnection:
         return self._client.want_write()
 
     def close(self) -> None:
-        """Say goodbye, so that the last will stays unsaid, after what was published."""
-        end = time.monotonic() + 1.0
-        while not self.lost and self._client.want_write() and time.monotonic() < end:
+        """Say goodbye, so that the last will stays unsaid, once the broker has what was published (amqtt drops the rest)."""
+        end = time.monotonic() + GOODBYE_S
+        while not self.lost and self._last and not self._last.is_published() and time.monotonic() < end:
             self.wait(0.05)
         self._client.disconnect()
         self._client.loop_misc()

@@ -18,8 +18,7 @@ import msgspec
 
 from bridge import wire
 from bridge.clock import Clock
-from bridge.delivered import Delivered
-from bridge.delivered import delivered_path as delivered_path
+from bridge.delivered import Delivered, delivered_path
 from bridge.link import Answer, Beside, BridgeLink, Samples
 from bridge.mqtt import Address, MqttConnection, MqttError, Received, Tls, Waker
 from bridge.outbox import BACKLOG_PER_S, RETRY_NS, WINDOW, Outbox, Verdict

@@ -286,7 +286,7 @@ class ReceiverThread:
 def event_line(arrival: Arrival) -> str:
     """One readable line: time, unit, alarm, event, text; how it came where that matters."""
     alarm = arrival.alarm
-    time = alarm.utc or f"{alarm.t} s"
+    time = alarm.utc or f"{alarm.t:.3f} s"
     attempt = f" {alarm.attempt}" if alarm.attempt else ""
     notes = [note for note, true in (("passive", alarm.passive), ("late", alarm.historical),
                                      ("conflict", arrival.outcome is Outcome.CONFLICT)) if true]

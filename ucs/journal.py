@@ -160,7 +160,7 @@ def _utc(text: str) -> datetime:
 
 def _text_writer(values: bool) -> Writer:
     def write(event: Event) -> None:
-        moment = event.utc or f"{event.t} s"
+        moment = event.utc or f"{event.t:.3f} s"
         attempt = f" {event.attempt}" if event.attempt else ""
         unsure = event.utc is not None and not event.utc_trusted
         notes = " (passive)" * event.passive + " (clock not synchronised)" * unsure

@@ -4,12 +4,12 @@ from __future__ import annotations
 import os
 import socket
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from bridge.link import Answer, Beside, BridgeLink, Instruct, LinkedJournal, Poke, RunLink, Samples
+from bridge.link import Answer, Beside, BridgeLink, Instruct, Poke, RunLink, Samples
 from level1.command import Order
 from level1.event import Event, Monitor, Result, seconds
 
@@ -89,26 +89,3 @@ def test_a_long_path_is_no_obstacle(tmp_path: Path) -> None:
 def test_only_the_owner_may_send_orders(journal: Path, ends: tuple[RunLink, BridgeLink]) -> None:
     mode = journal.with_name("journal.db.run.sock").stat().st_mode
     assert stat.S_IMODE(mode) == 0o600
-
-
-class FullDisk:
-    """A journal whose disk takes nothing."""
-
-    def __init__(self) -> None:
-        self.pending: tuple[Event, ...] = ()
-        self.fault: str | None = "full"
-        self.incidents = ("it was gone",)
-
-    def append(self, events: Sequence[Event], state: bytes) -> bool:
-        self.pending += tuple(events)
-        return False
-
-
-def test_what_the_disk_does_not_take_goes_beside_the_journal_again_and_again(ends: tuple[RunLink, BridgeLink]) -> None:
-    run, bridge = ends
-    journal = LinkedJournal(FullDisk(), run)
-    assert not journal.append((EVENT,), b"")
-    assert bridge.receive() == [Beside((EVENT,))]
-    journal.publish([MONITOR, Result("c-1", "done")])
-    assert bridge.receive() == [Samples((MONITOR,)), Answer(Result("c-1", "done")), Beside((EVENT,))]
-    assert (journal.fault, journal.incidents) == ("full", ("it was gone",))

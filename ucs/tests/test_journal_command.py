@@ -1,0 +1,140 @@
+"""`ucs journal`: what happened, for people and for programs."""
+from __future__ import annotations
+
+import csv
+import io
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from level1.event import Event, SentFrame, decode, seconds
+from level1.io.journal import Journal
+from ucs.main import main
+
+ROOT = Path(__file__).parents[2]
+CONFIG = """
+[unit]
+name = "tractor-7"
+[[bus]]
+name = "implement"
+channel = "vcan0"
+dbc = ["flaming_tool.dbc"]
+"""
+
+
+def an_event(seq: int, alarm: str, event: str, utc: str | None = None, boot: int = 1, **more: object) -> Event:
+    values = {"FLAMER_STATUS.PilotFlame": "Off"} if event == "raised" else {}
+    return Event("tractor-7", boot, seq, seconds(seq * 10**9), utc, utc is not None, alarm, 3101, "High", event, 1, 0, values,
+                 "Pilot flame out", **more)  # type: ignore[arg-type]
+
+
+EVENTS = [
+    an_event(1, "PilotFlameOut", "raised", "2025-05-01T10:00:00.500Z"),
+    an_event(2, "PilotFlameOut", "repair_started", "2025-05-01T10:00:01Z", frames=(SentFrame("FLAMER_CMD", "651", "00"),),
+             passive=True),
+    an_event(3, "BottleEmpty", "raised", "2025-05-01T11:00:00Z"),
+    an_event(4, "BottleEmpty", "cleared"),
+]
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Iterator[Path]:
+    (tmp_path / "unit.toml").write_text(CONFIG + '[journal]\npath = "journal.db"\n')
+    with Journal(tmp_path / "journal.db", "tractor-7") as journal:
+        journal.append(EVENTS, b"")
+        yield tmp_path / "unit.toml"
+
+
+def shown(capsys: pytest.CaptureFixture[str], *args: object) -> str:
+    capsys.readouterr()
+    assert main(["journal", *map(str, args)]) == 0
+    return capsys.readouterr().out
+
+
+def test_events_are_listed_one_a_line(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert shown(capsys, unit).splitlines() == [
+        "2025-05-01T10:00:00.500Z  1.1  PilotFlameOut  raised  Pilot flame out",
+        "2025-05-01T10:00:01Z  1.2  PilotFlameOut  repair_started  Pilot flame out (passive)",
+        "2025-05-01T11:00:00Z  1.3  BottleEmpty  raised  Pilot flame out",
+        "4.000 s  1.4  BottleEmpty  cleared  Pilot flame out",
+    ]
+
+
+def test_a_journal_file_will_do_as_well(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert shown(capsys, unit.with_name("journal.db")) == shown(capsys, unit)
+
+
+@pytest.mark.parametrize(("options", "seqs"), [
+    (["--alarm", "BottleEmpty"], [3, 4]),
+    (["--event", "raised"], [1, 3]),
+    (["--alarm", "BottleEmpty", "--event", "raised"], [3]),
+    (["--since", "2025-05-01T10:30"], [3]),
+    (["--until", "2025-05-01T10:30:00Z"], [1, 2]),
+    (["--since", "2025-05-01T12:00:00+02:00", "--until", "2025-05-01T10:00:01Z"], [1]),
+    (["--since", "1 h"], []),
+    (["--last", "2"], [3, 4]),
+    (["--last", "1", "--event", "raised"], [3]),
+    (["--boot", "1"], [1, 2, 3, 4]),
+    (["--boot", "2"], []),
+])
+def test_events_are_chosen(unit: Path, capsys: pytest.CaptureFixture[str], options: list[str], seqs: list[int]) -> None:
+    lines = shown(capsys, unit, "--format", "jsonl", *options).splitlines()
+    assert [decode(line).seq for line in lines] == seqs
+
+
+def test_freeze_frames_and_sent_frames_are_shown(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = shown(capsys, unit, "--values").splitlines()
+    assert "    FLAMER_STATUS.PilotFlame = Off" in lines
+    assert "    sent FLAMER_CMD 651#00" in lines
+
+
+def test_json_lines_are_the_events(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert [decode(line) for line in shown(capsys, unit, "--format", "jsonl").splitlines()] == EVENTS
+
+
+def test_csv_has_a_row_for_each_event(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = list(csv.DictReader(io.StringIO(shown(capsys, unit, "--format", "csv"))))
+    assert [row["seq"] for row in rows] == ["1", "2", "3", "4"]
+    assert json.loads(rows[0]["values"]) == {"FLAMER_STATUS.PilotFlame": "Off"}
+    assert json.loads(rows[1]["frames"]) == [{"message": "FLAMER_CMD", "id": "651", "data": "00"}]
+
+
+def test_nothing_to_show_is_told_apart_from_nothing_yet(unit: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["journal", str(unit), "--alarm", "Other"]) == 0
+    assert "no such event" in capsys.readouterr().err
+    Journal(tmp_path / "empty.db", "tractor-8").close()
+    assert main(["journal", str(tmp_path / "empty.db")]) == 0
+    assert "no event yet" in capsys.readouterr().err
+
+
+def test_following_shows_events_as_they_come(tmp_path: Path) -> None:
+    with Journal(tmp_path / "journal.db", "tractor-7") as journal:
+        journal.append(EVENTS[:1], b"")
+        command = [sys.executable, "-m", "ucs", "journal", str(tmp_path / "journal.db"), "--follow"]
+        follower = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        assert follower.stdout
+        assert "1.1" in follower.stdout.readline()
+        journal.append(EVENTS[1:2], b"")
+        assert "1.2" in follower.stdout.readline()
+        follower.send_signal(signal.SIGINT)
+        assert follower.wait(timeout=20) == 0
+        follower.stdout.close()
+
+
+@pytest.mark.parametrize(("args", "told"), [
+    (["missing.db"], "no such file"),
+    (["missing.toml"], "no such file"),
+    (["unit.toml"], "journal: missing; write [journal] path"),
+    (["unit.toml", "--since", "yesterday"], '--since "yesterday": no time; write'),
+    (["unit.toml", "--last", "0"], "--last 0: write a number from 1"),
+])
+def test_mistakes_are_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], args: list[str], told: str) -> None:
+    (tmp_path / "unit.toml").write_text(CONFIG)
+    assert main(["journal", str(tmp_path / args[0]), *args[1:]]) == 2
+    error = capsys.readouterr().err
+    assert told in error and error.count("\n") == 1
