@@ -98,8 +98,9 @@ class Repair(msgspec.Struct, frozen=True):
     """The local repair of an alarm: steps, the steps into the safe state, and the budget (DESIGN §5).
 
     moves: it moves something, so it is inhibited while the unit is stopped or paused from above (attribute RepairMoves,
-    default Yes). safe_between: a failed attempt enters the safe state at once; else (attribute RepairBetween, AsCommanded) its
-    messages return to what was commanded before the episode, and each attempt begins from there. local_reset: a lock-out can only be reset on board (attribute RepairReset, default Local).
+    default Yes). safe_between: a failed attempt enters the safe state at once; else (attribute RepairBetween, AsCommanded)
+    its messages return to what was commanded before the episode, and each attempt begins from there. local_reset: a lock-
+    out can only be reset on board (attribute RepairReset, default Local).
     """
 
     steps: tuple[Step, ...]
@@ -143,6 +144,11 @@ class Alarm(msgspec.Struct, frozen=True):
     repair: Repair | None = None
     file: str = ""
     line: int = 0
+
+    @property
+    def signal(self) -> str:
+        """Name of its signal in its message; the alarm's own name carries the bus where there are several (`buses`)."""
+        return self.name.partition("@")[0]
 
     @property
     def is_fault(self) -> bool:

@@ -567,12 +567,12 @@ class Supervisor:
         """Carry an order out; gives the reason of a refusal."""
         if order.name in ("acknowledge", "reset"):
             return self._people(order)
-        command = self.catalog.commands.get(order.name)
-        if order.name not in ("pause", "resume", "stop") and command is None:
+        commands = [command for name, command in self.catalog.commands.items() if order.name in (name, name.partition("@")[0])]
+        if order.name not in ("pause", "resume", "stop") and not commands:
             return f"unknown command {order.name}"
         if order.name == "resume" and self.mode == "stopped" and order.origin == "above":
             return "the unit was stopped: it is started again at the machine"
-        if command is not None:
+        for command in commands:
             try:
                 self.send(self.now_ns, command.message, self._command_payload(command, order), f"command {order.name}")
             except (Refused, ValueError) as refusal:
@@ -714,12 +714,12 @@ class _Broadcast:
         self.message = message
         self.order = supervisor.timers.order()
         self.due = FAR
-        self.alarms = [alarm.name for alarm in supervisor.catalog.alarms.values() if alarm.message == message.name]
+        self.alarms = [(alarm.name, alarm.signal) for alarm in supervisor.catalog.alarms.values() if alarm.message == message.name]
 
     def expire(self, now_ns: int) -> None:
         """Send it as it is now."""
         supervisor = self.supervisor
-        payload = encode(self.message, {name: supervisor.bus_state(name) for name in self.alarms})
+        payload = encode(self.message, {signal: supervisor.bus_state(name) for name, signal in self.alarms})
         try:
             supervisor.send(now_ns, self.message.name, payload, "alarm states")
         except Refused:

@@ -44,7 +44,7 @@ def run(args: Namespace) -> int:
     unit = config.load(args.unit_toml) if args.unit_toml else None
     if not args.dbc and unit is None:
         raise OutsideError("no definitions: give --dbc FILE …, or --unit-toml FILE")
-    catalog = definitions.load(args.dbc) if args.dbc or unit is None else definitions.load((), unit.bus_files)
+    catalog = definitions.load(args.dbc) if args.dbc or unit is None else definitions.load((), unit.bus_files, unit.bus_names)
     if unit:
         config.check_armed(unit, catalog)
     armed = unit.repairs.armed if unit else None

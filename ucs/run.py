@@ -40,7 +40,7 @@ def add_parser(commands: Any) -> None:
 def run(args: Namespace) -> int:
     """Supervise, or only check."""
     settings = config.load(args.unit)
-    catalog = definitions.load((), settings.bus_files)
+    catalog = definitions.load((), settings.bus_files, settings.bus_names)
     config.check_armed(settings, catalog)
     if args.check:
         print(*_start_lines(settings, catalog), f"{settings.path}: good", sep="\n")

@@ -98,6 +98,11 @@ class Config(msgspec.Struct, frozen=True):
     path: str = ""
 
     @property
+    def bus_names(self) -> tuple[str, ...]:
+        """Names of the buses, by index."""
+        return tuple(bus.name for bus in self.bus)
+
+    @property
     def bus_files(self) -> dict[int, tuple[str, ...]]:
         """Index of each bus -> its DBC files, as `level1.io.definitions.load` takes them."""
         return {index: bus.dbc for index, bus in enumerate(self.bus)}

@@ -18,6 +18,7 @@ from pathlib import Path
 import msgspec
 
 import dbc
+from level1 import buses
 from level1.catalog import Catalog, DefinitionError, Problem
 
 MEMORY_LIMIT = 900_000_000
@@ -51,16 +52,21 @@ class Examination(msgspec.Struct, frozen=True):
     alarms: int = 0
 
 
-def load(files: Sequence[str | Path], bus_files: Mapping[int, Sequence[str | Path]] | None = None) -> Catalog:
+def load(files: Sequence[str | Path], bus_files: Mapping[int, Sequence[str | Path]] | None = None,
+         bus_names: Sequence[str] = ()) -> Catalog:
     """The catalog of some DBC files. Raises DefinitionError with all errors and warnings when there is any error.
 
     files: paths; a bare name that is no file in the current folder means a shipped one. bus_files: bus index -> the files
     bound to it, loaded as well when `files` doesn't name them; messages of the other files are bound to no bus in particular.
+    bus_names: by index; a file bound to several buses gives a copy of its messages and alarms for each (`level1.buses`).
     """
     found = examine(files, bus_files)
     if found.catalog is None:
         raise DefinitionError(found.problems)
-    return found.catalog
+    catalog, problems = buses.split(found.catalog, bus_names or tuple(map(str, bus_files or ())))
+    if problems:
+        raise DefinitionError((*found.problems, *problems))
+    return catalog
 
 
 def examine(files: Sequence[str | Path], bus_files: Mapping[int, Sequence[str | Path]] | None = None) -> Examination:
