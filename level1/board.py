@@ -203,8 +203,9 @@ class Page:
 class Watchdog:
     """Watches over all pages with the same first limit of silence, so that their frames need not move a deadline.
 
-    It makes two rounds within a limit. A page whose limit ends by the next round gets its exact deadline; the others, on a
-    healthy bus all of them, cost one comparison a round. It rests while all of its pages are silent.
+    It makes a round each three fifths of the limit. A page whose limit ends by the next round gets its exact deadline; the
+    others cost one comparison a round. On a healthy bus they are all others: a cyclic message is one cycle old at most, so
+    that a limit of three cycles leaves two, and the next round is due in 1.8. It rests while all of its pages are silent.
     """
 
     __slots__ = ("due", "limit_ns", "order", "pages", "period_ns", "timers")
@@ -214,7 +215,7 @@ class Watchdog:
         self.order = timers.order()
         self.due = FAR
         self.limit_ns = limit_ns
-        self.period_ns = max(1, limit_ns // 2)
+        self.period_ns = max(1, limit_ns * 3 // 5)
         self.pages: list[Page] = []
 
     def wake(self, t_ns: int) -> None:
@@ -228,10 +229,11 @@ class Watchdog:
         last_heard_ns = next_ns - self.limit_ns
         awake = False
         for page in self.pages:
-            if page.level == 0:
+            if page.t_ns > last_heard_ns:
                 awake = True
-                if page.t_ns <= last_heard_ns:
-                    self.timers.set(page, page.t_ns + self.limit_ns)
+            elif page.level == 0:
+                awake = True
+                self.timers.set(page, page.t_ns + self.limit_ns)
         if awake:
             self.timers.set(self, next_ns)
 

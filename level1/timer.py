@@ -46,12 +46,11 @@ class Timers:
     def pop(self, now_ns: int) -> Timed | None:
         """The next item whose deadline (then `popped_ns`) is not after `now_ns`, with its `due` reset; None when there is none."""
         heap = self.heap
-        while heap and heap[0][0] <= now_ns:
+        while self.next_ns <= now_ns:
             due, _, item = heapq.heappop(heap)
+            self.next_ns = heap[0][0] if heap else FAR
             if item.due == due:
                 item.due = FAR
                 self.popped_ns = due
-                self.next_ns = heap[0][0] if heap else FAR
                 return item
-        self.next_ns = heap[0][0] if heap else FAR
         return None
