@@ -4,7 +4,8 @@ from __future__ import annotations
 from typing import Any
 
 from level1.catalog import Alarm, Catalog, Problem
-from level1.definitions import ATTRIBUTES, Source, build
+from level1.definitions import Source, build
+from level1.definitions.attributes import ATTRIBUTES
 
 ALARMS = 1616
 """Identifier of the message that holds the alarms."""

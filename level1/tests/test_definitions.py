@@ -264,7 +264,7 @@ def test_the_words_of_an_enumeration_may_stand_in_any_order_in_the_file() -> Non
     (attribute("AlarmWhen", "Flame == Off"), "AlarmCode", "has no code"),
     (attribute("AlarmCode", 7), "AlarmWhen", "has no condition"),
     (alarm_lines(code=70000), "AlarmCode", "70000 is not possible"),
-    (alarm_lines(AlarmPriority=9), "AlarmPriority", "9 is no value"),
+    (alarm_lines(AlarmPriority=9), "AlarmPriority", "9 is no value of it"),
     (alarm_lines(AlarmOnDelay=-5), "AlarmOnDelay", "-5 is not possible"),
     (alarm_lines(AlarmSpn=524288), "AlarmSpn", "not possible"),
     (alarm_lines(Repair="wait 1 s", RepairAttempts=0), "RepairAttempts", "0 is not possible"),
@@ -292,6 +292,49 @@ def test_an_attribute_defined_with_a_wrong_type_is_an_error_with_the_line_to_wri
 def test_an_attribute_that_looks_like_one_of_ours_is_a_warning() -> None:
     problems = found('BA_DEF_ SG_ "AlarmOnDelayMs" INT 0 1;', alarm_lines())
     assert [(p.severity, p.hint) for p in problems] == [("warning", "did you mean `AlarmOnDelay`?")]
+
+
+@pytest.mark.parametrize(("line", "severity", "message", "hint"), [
+    ('BA_ "AlarmOnDelay" SG_ 1616 FlamOut 300;', "error", "message ALARMS has no signal `FlamOut`", "did you mean `FlameOut`?"),
+    ('BA_ "AlarmOnDelay" SG_ 1661 FlameOut 300;', "error", "no message with the identifier 1661", "did you mean `1616`?"),
+    ('BA_ "AlarmCause" BO_ 1616 "wind";', "error", "belongs to signals", "write SG_"),
+    ('BA_ "AlarmCode" SG_ 1616 FlameOut 2;', "warning", "is set twice, first in line", "remove one"),
+    ('BA_ "AlarmPriority" SG_ 1616 FlameOut "Hihg";', "error", "is no value of it", "did you mean `High`? its values are"),
+    ('BA_ "AlarmOnDelay" SG_ 1616 FlameOut "soon";', "error", "is no number", "without quotes"),
+])
+def test_an_attribute_that_would_be_passed_over_is_told(line: str, severity: str, message: str, hint: str) -> None:
+    problems = found(alarm_lines(), line)
+    told = [(problem.severity, message in problem.message, hint in problem.hint) for problem in problems]
+    assert told == [(severity, True, True)], list(map(str, problems))
+    assert problems[0].line == line_of(line, alarm_lines(), line)
+
+
+def test_a_word_of_an_enumeration_may_be_written_out_and_a_number_in_quotes() -> None:
+    built = alarm(AlarmPriority="High", AlarmLatch="Yes", AlarmOnDelay="300")
+    assert (built.priority, built.latch, built.on_delay_ns) == ("High", True, 300_000_000)
+
+
+def test_half_a_trouble_code_is_told() -> None:
+    assert [p.attribute for p in found(alarm_lines(AlarmSpn=100))] == ["AlarmSpn"]
+    assert [p.attribute for p in found(alarm_lines(AlarmFmi=4))] == ["AlarmFmi"]
+
+
+@pytest.mark.parametrize(("first", "second", "circle"), [
+    ("Running and FlameOut == Normal", "Level < 1", "FlameOut -> FlameOut"),
+    ("PressureLow == Active", "Running and state(FlameOut) == Normal", "FlameOut -> PressureLow -> FlameOut"),
+])
+def test_alarms_that_ask_for_their_own_state_are_told(first: str, second: str, circle: str) -> None:
+    problems = found(alarm_lines(first), alarm_lines(second, 2, "PressureLow"))
+    assert [circle in problem.message for problem in problems] == [True]
+
+
+def test_alarms_may_ask_for_others_and_count_themselves() -> None:
+    assert not found(alarm_lines("PressureLow == Active", AlarmUntil="count(FlameOut, 1 min) < 2 and PressureLow == Normal"),
+                     alarm_lines("Level < 1", 2, "PressureLow"))
+
+
+def test_the_name_of_a_monitoring_message_can_be_a_topic() -> None:
+    assert [p.attribute for p in found(attribute("MonitorAs", "burners/all", "", 256))] == ["MonitorAs"]
 
 
 def test_attributes_on_a_signal_that_is_no_alarm_are_told() -> None:
@@ -439,6 +482,15 @@ def test_multiplexed_signals() -> None:
     assert sub.is_multiplexer and (sub.multiplexer_signal, sub.multiplexer_ids) == ("Page", (1,))
     assert (a.multiplexer_signal, a.multiplexer_ids) == ("Page", (0, 4, 5, 6))
     assert (b.multiplexer_signal, b.multiplexer_ids) == ("Sub", (2,))
+
+
+def test_long_names_stand_in_for_short_ones() -> None:
+    long = ("BO_ 300 MUX: 8 TOOL\n SG_ Pg M : 0|8@1+ (1,0) [0|0] \"\" UCS\n SG_ A m1 : 8|8@1+ (1,0) [0|0] \"\" UCS\n"
+            'BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;\nBA_DEF_ BO_ "SystemMessageLongSymbol" STRING ;\n'
+            'BA_DEF_DEF_ "SystemSignalLongSymbol" "";\nBA_DEF_DEF_ "SystemMessageLongSymbol" "";\n'
+            'BA_ "SystemSignalLongSymbol" SG_ 300 Pg "PageOfTheMessage";\nBA_ "SystemMessageLongSymbol" BO_ 300 "LONG_NAME";')
+    mux = catalog(long, alarm_lines("LONG_NAME.PageOfTheMessage > 3")).messages["LONG_NAME"]
+    assert mux.signal("A").multiplexer_signal == "PageOfTheMessage"
 
 
 @pytest.mark.parametrize(("old", "new", "severity", "message"), [
