@@ -40,7 +40,7 @@ WAITING_SENDS = 200
 PLAUSIBLE_AGE_NS = 1_000_000_000
 """A frame that waited longer in the kernel's buffer (278 frames by default) than this can't be."""
 EVEN_NS = 1_000_000
-"""By how much the wall clock may move against the monotonic one between two frames: NTP slews by 0.5 ms/s at most."""
+"""How exactly the two clocks are compared; moving apart by twice this between two frames is a jump (NTP slews 0.5 ms/s)."""
 _SIOCGIFFLAGS, _IFF_UP = 0x8913, 1
 
 # python-can tells the terminal what it also raises.
@@ -58,13 +58,14 @@ class Stamps:
         self._offset_ns: int | None = None
         self._even_since_ns = 0
 
-    def monotonic_ns(self, stamp_ns: int, now_ns: int, wall_ns: int) -> int:
-        """When a frame came that was read at `now_ns`, while the wall clock showed `wall_ns`."""
+    def monotonic_ns(self, stamp_ns: int, before_ns: int, wall_ns: int, now_ns: int) -> int:
+        """When a frame came, by its stamp. The wall clock showed `wall_ns` between `before_ns` and `now_ns`."""
         offset = wall_ns - now_ns
-        if self._offset_ns is None or abs(offset - self._offset_ns) > EVEN_NS:
-            # What was stamped before a jump may still be on its way.
-            self._even_since_ns = now_ns + PLAUSIBLE_AGE_NS if self._offset_ns is not None else now_ns
-        self._offset_ns = offset
+        if now_ns - before_ns <= EVEN_NS:  # else the thread was interrupted between its looks at the clocks
+            if self._offset_ns is not None and abs(offset - self._offset_ns) > 2 * EVEN_NS:
+                # What was stamped before a jump may still be on its way.
+                self._even_since_ns = now_ns + PLAUSIBLE_AGE_NS
+            self._offset_ns = offset
         age = wall_ns - stamp_ns
         return now_ns - age if 0 <= age < PLAUSIBLE_AGE_NS and now_ns >= self._even_since_ns else now_ns
 
@@ -164,9 +165,8 @@ class Port:
         message = self._bus.recv(POLL_S)
         if self._suspect:
             raise BusError(self._suspect)
-        now_ns = self._clock()
         if self._lost_ns is not None:
-            self._find(now_ns)
+            self._find()
         if message is None:
             return
         try:
@@ -174,7 +174,7 @@ class Port:
         except ValueError:
             self.counters["impossible"] += 1
             return
-        t_ns = stamps.monotonic_ns(int(message.timestamp * 1e9), now_ns, self._wall())
+        t_ns = stamps.monotonic_ns(int(message.timestamp * 1e9), self._clock(), self._wall(), self._clock())
         self._inbox.put(Frame(t_ns, key | self.index << BUS_SHIFT, data))
 
     def _lose(self, error: Exception) -> None:
@@ -184,7 +184,8 @@ class Port:
             self.counters["lost"] += 1
             self._inbox.notice(f"bus {self.settings.name}: lost ({_reason(error)}); trying again")
 
-    def _find(self, now_ns: int) -> None:
+    def _find(self) -> None:
+        now_ns = self._clock()
         away_s = (now_ns - (self._lost_ns or now_ns)) / 1e9
         self._lost_ns = None
         self._inbox.notice(f"bus {self.settings.name}: back after {away_s:.1f} s")

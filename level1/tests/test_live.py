@@ -113,34 +113,46 @@ def started() -> Iterator[Callable[..., tuple[Port, Inbox]]]:
         assert not port._thread.is_alive()
 
 
+def come(stamps: Stamps, stamp_ns: int, now_ns: int, wall_ns: int) -> int:
+    """When a frame came, with both clocks read at once."""
+    return stamps.monotonic_ns(stamp_ns, now_ns, wall_ns, now_ns)
+
+
 class TestStamps:
     """Wall-clock stamps become times of the monotonic clock."""
 
     def test_a_plausible_age_is_believed(self) -> None:
         stamps = Stamps()
-        assert stamps.monotonic_ns(50_000 * MS - 7 * MS, 1_000 * MS, 50_000 * MS) == 993 * MS
+        assert come(stamps, 50_000 * MS - 7 * MS, 1_000 * MS, 50_000 * MS) == 993 * MS
 
     def test_a_stamp_from_the_future_or_of_another_clock_counts_from_now(self) -> None:
         stamps = Stamps()
         for stamp in (50_001 * MS, 0, 49_000 * MS - 1):
-            assert stamps.monotonic_ns(stamp, 1_000 * MS, 50_000 * MS) == 1_000 * MS
+            assert come(stamps, stamp, 1_000 * MS, 50_000 * MS) == 1_000 * MS
 
     @pytest.mark.parametrize("jump_ms", [-3_600_000, -300, 300, 3_600_000])
     def test_after_a_jump_of_the_wall_clock_stamps_are_not_believed_for_a_while(self, jump_ms: int) -> None:
         stamps = Stamps()
-        assert stamps.monotonic_ns(50_000 * MS, 1_000 * MS, 50_000 * MS) == 1_000 * MS
+        assert come(stamps, 50_000 * MS, 1_000 * MS, 50_000 * MS) == 1_000 * MS
         # Stamped 5 ms ago, before the clock jumped.
-        assert stamps.monotonic_ns(50_005 * MS, 1_010 * MS, (50_010 + jump_ms) * MS) == 1_010 * MS
+        assert come(stamps, 50_005 * MS, 1_010 * MS, (50_010 + jump_ms) * MS) == 1_010 * MS
         later = 1_010 * MS + PLAUSIBLE_AGE_NS
         wall = (50_010 + jump_ms) * MS + PLAUSIBLE_AGE_NS
-        assert stamps.monotonic_ns(wall - 2 * MS, later, wall) == later - 2 * MS
+        assert come(stamps, wall - 2 * MS, later, wall) == later - 2 * MS
+
+    def test_an_interruption_between_the_clocks_is_no_jump(self) -> None:
+        stamps = Stamps()
+        assert come(stamps, 50_000 * MS, 1_000 * MS, 50_000 * MS) == 1_000 * MS
+        # 20 ms pass between the look at the wall clock and the one at the monotonic clock.
+        assert stamps.monotonic_ns(50_009 * MS, 1_010 * MS, 50_010 * MS, 1_030 * MS) == 1_029 * MS
+        assert come(stamps, 50_038 * MS, 1_040 * MS, 50_040 * MS) == 1_038 * MS
 
     @given(st.lists(st.tuples(st.integers(0, 10**9), st.integers(-10**12, 10**12), st.integers(-10**13, 10**13)), max_size=20))
     def test_no_stamp_lies_in_the_future_or_far_back(self, steps: list[tuple[int, int, int]]) -> None:
         stamps, now, wall = Stamps(), 10**12, 10**15
         for passed, jump, age in steps:
             now, wall = now + passed, wall + passed + jump
-            assert now - PLAUSIBLE_AGE_NS < stamps.monotonic_ns(wall - age, now, wall) <= now
+            assert now - PLAUSIBLE_AGE_NS < come(stamps, wall - age, now, wall) <= now
 
 
 class TestInbox:
