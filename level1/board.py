@@ -100,7 +100,8 @@ class Page:
     (ns of silence, rising) have passed; -1 before the first frame."""
 
     __slots__ = ("always", "board", "branches", "cells", "data", "decode", "due", "handle", "integrity", "level", "limits",
-                 "message", "order", "others", "owner", "presence", "protection", "seen", "selector", "stale_level", "t_ns", "watchdog")
+                 "message", "order", "others", "owner", "presence", "protection", "seen", "selector", "stale_level", "t_ns",
+                 "watchdog")
 
     def __init__(self, board: Board, message: Message):
         self.board = board
@@ -356,6 +357,7 @@ class Board:
         self.branches: dict[tuple[str, str, tuple[int, ...]], Page] = {}
         self.table: dict[int, Page | Tap | None] = {}
         self.listeners: dict[int, Callable[[int, int, bytes], None]] = {}
+        self.newcomer: Callable[[int], None] = _unnoticed
         self.queued: list[Watch] = []
         self.watches = 0
         self.refresh: Callable[[Page], None] = _as_it_is
@@ -493,6 +495,7 @@ class Board:
         A J1939 message with any source address belongs to the first source that sends it, until that one falls silent:
         two sources that alternate must not make its values flap.
         """
+        self.newcomer(key)
         page: Page | Tap | None = self._find(key)
         if key & EXTENDED and not key & (REMOTE | ERROR_FRAME):
             listener = self.listeners.get(j1939_pgn(key & 0x1FFF_FFFF))
@@ -647,6 +650,10 @@ class Board:
         if page.level < 0:
             return None, NEVER
         return raw_of(cell.signal, page.data), cell.quality
+
+
+def _unnoticed(key: int) -> None:
+    return None
 
 
 def _index(watch: Watch) -> int:

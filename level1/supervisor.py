@@ -7,11 +7,12 @@ it comes frame by frame or in batches. A time stamp that runs backwards is clamp
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 from itertools import chain
 from typing import Any
+from zlib import crc32
 
 import msgspec
 
@@ -21,7 +22,7 @@ from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Alarm, Catalog
 from level1.command import Order
 from level1.condition import Compiler, Things, Thresholds, Verdict, Zone, walk
 from level1.decode import GOOD, QUALITY_WORDS, RawValue, encode
-from level1.event import Event, Monitor, Output, Result, Send, SentFrame, seconds
+from level1.event import PRIORITIES, Event, Monitor, Output, Result, Send, SentFrame, seconds
 from level1.expression import (
     AlarmState,
     Count,
@@ -36,15 +37,22 @@ from level1.expression import (
     Silent,
     Step,
 )
-from level1.frame import BUS_SHIFT, Frame, frame_key
+from level1.frame import BUS_SHIFT, EXTENDED, Frame, frame_key
 from level1.gate import Gate, Refused
 from level1.j1939 import DM1, FMI_WORDS, TP_CM, TP_DT, Transport, TroubleCodeReport, parse_dm1
+from level1.j1939_node import ADDRESS_CLAIMED, REQUEST, Node, name_of
 from level1.repair import RepairMachine
 from level1.timer import FAR, Timed, Timers
 
 STATE_WORDS = ("Normal", "Active", "Repairing", "LockedOut")
 TROUBLE_CODE = "TroubleCode"
 """Alarm of `ucs.dbc` whose causes are the active trouble codes of all senders."""
+ADDRESS_CONFLICT = "AddressConflict"
+"""Alarm of `ucs.dbc`: another node claims or uses the address of the UCS."""
+SECOND_TALKER = "SecondTalker"
+"""Alarm of `ucs.dbc`: someone else sends a message that is the UCS's own."""
+PROTOCOL_LIFE_NS = 100_000_000
+"""A frame of a protocol is worthless after this."""
 UNTOLD = -1
 """Outcome of a condition before its first evaluation: whatever it is then, its alarm is told."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -84,16 +92,17 @@ class State(msgspec.Struct, frozen=True):
 class Supervisor:
     """Supervises one unit.
 
-    unit: its name. boot, with the seq given to each event, is the event's identity: never give the same boot twice. seq: last
-    one used. armed: alarms whose repairs may act; None arms all. broadcast: send the alarm messages on the bus. start_ns: when
-    the time line begins, None: at the first input. monitor_ns: period of the monitoring messages, None for none.
-    utc_offset_ns: UTC minus time line, None where no wall clock is known; it may be set at any time, as may utc_trusted.
-    restored: the state stored at the end of an earlier boot.
+    unit: its name. boot, with the seq given to each event, is the event's identity: never give the same boot twice. seq:
+    last one used. j1939: bus index -> source address to claim there. armed: alarms whose repairs may act; None arms all.
+    broadcast: send the alarm messages on the bus. start_ns: when the time line begins, None: at the first input.
+    monitor_ns: period of the monitoring messages, None for none. utc_offset_ns: UTC minus time line, None where no wall
+    clock is known; it may be set at any time, as may utc_trusted. restored: the state stored at the end of an earlier boot.
     """
 
     def __init__(self, catalog: Catalog, *, unit: str, boot: int = 1, seq: int = 0, armed: Collection[str] | None = None,
                  broadcast: bool = True, start_ns: int | None = None, monitor_ns: int | None = None,
-                 utc_offset_ns: int | None = None, utc_trusted: bool = False, restored: State | None = None):
+                 utc_offset_ns: int | None = None, utc_trusted: bool = False, restored: State | None = None,
+                 j1939: Mapping[int, int] | None = None):
         self.catalog = catalog
         self.unit = unit
         self.boot = boot
@@ -119,10 +128,16 @@ class Supervisor:
         self._inputs: dict[str, list[tuple[str, Callable[[int], Any]]]] = {}
         self._watches: list[Watch] = []
         self._repairs: dict[str, RepairMachine] = {}
+        self._nodes = {bus: self._node(bus, address) for bus, address in (j1939 or {}).items()}
         self._compile()
         self._broadcasts = self._make_broadcasts() if broadcast else {}
         self._samplers = self._make_samplers(monitor_ns) if monitor_ns else []
         self.gate = Gate(catalog, self._sendable())
+        self._heard_ns = self.now_ns
+        self._own_keys = frozenset(
+            frame_key(message.can_id, message.extended, bus) for name in self._broadcasts
+            for message in (catalog.messages[name],) if message.senders == ("UCS",) for bus in catalog.buses.get(name, (0,)))
+        self.board.newcomer = self._newcomer
 
     # --- inputs -----------------------------------------------------------------------------------------------------------
 
@@ -148,6 +163,7 @@ class Supervisor:
             if page is None:
                 continue
             if page is _MISSING:
+                self._heard_ns = t
                 page = bind(key)
                 if page is None:
                     continue
@@ -270,6 +286,8 @@ class Supervisor:
             watch.queued = True
         self.board.queued.extend(self._watches)
         self.board.settle(start)
+        for node in self._nodes.values():
+            node.start(start)
         cyclic: list[Timed] = [*self._broadcasts.values(), *self._samplers]
         for timed in cyclic:
             self.timers.set(timed, start)
@@ -302,12 +320,46 @@ class Supervisor:
                 self._compile_repair(machine, alarm.repair, compiler)
         for (name, window_ns), cell in things.counts.items():
             self._counts.append(_Window(self, name, window_ns, cell))
-        if TROUBLE_CODE in self._alarms or things.codes:
-            transport = Transport(board.deliver, self.counters)
-            board.listen(TP_CM, transport.connection)
-            board.listen(TP_DT, transport.packet)
-            board.listen(DM1, self._diagnosed)
+        if TROUBLE_CODE in self._alarms or things.codes or self._nodes:
+            self._listen(Transport(board.deliver, self.counters))
         board.compile()
+
+    def _listen(self, transport: Transport) -> None:
+        """Hear what J1939 says beyond single frames, and let the own node answer where there is one."""
+        def answered(answer: Callable[[Node, int, int, bytes], None],
+                     listen: Callable[[int, int, bytes], None] | None = None) -> Callable[[int, int, bytes], None]:
+            def listener(t_ns: int, key: int, data: bytes) -> None:
+                if listen is not None:
+                    listen(t_ns, key, data)
+                node = self._nodes.get(key >> BUS_SHIFT)
+                if node is not None:
+                    answer(node, t_ns, key, data)
+            return listener
+        self.board.listen(DM1, self._diagnosed)
+        self.board.listen(TP_CM, answered(Node.connection, transport.connection))
+        self.board.listen(TP_DT, answered(Node.packet, transport.packet))
+        if self._nodes:
+            self.board.listen(ADDRESS_CLAIMED, answered(Node.claimed))
+            self.board.listen(REQUEST, answered(Node.requested))
+
+    def _node(self, bus: int, address: int) -> Node:
+        def transmit(t_ns: int, key: int, data: bytes, what: str) -> None:
+            self._out.append(Send(t_ns, key, data, what, "J1939", t_ns + PROTOCOL_LIFE_NS))
+
+        def conflict(t_ns: int, contested: int, name: bytes | None) -> None:
+            other = name.hex().upper() if name else "unknown"
+            self.report(t_ns, ADDRESS_CONFLICT, str(bus), name is not None, {"SourceAddress": contested, "Bus": bus, "Name": other},
+                        f"another node {'claims' if name else 'uses'} source address {contested}")
+        return Node(bus, name_of(crc32(self.unit.encode())), address, self.timers, transmit, conflict)
+
+    def _newcomer(self, key: int) -> None:
+        """An identifier is heard for the first time: is it one that only this node may send?"""
+        if key in self._own_keys:
+            self.report(self._heard_ns, SECOND_TALKER, f"{key:X}", True, {"Id": f"{key & 0x1FFF_FFFF:X}", "Bus": key >> BUS_SHIFT},
+                        f"someone else sends the message with identifier {key & 0x1FFF_FFFF:X}")
+        node = self._nodes.get(key >> BUS_SHIFT)
+        if node is not None and key & EXTENDED and key >> 8 & 0x3FF00 != ADDRESS_CLAIMED:
+            node.used(self._heard_ns, key)
 
     def _diagnosed(self, t_ns: int, key: int, data: bytes) -> None:
         """A DM1: trouble codes appear and vanish."""
@@ -443,9 +495,18 @@ class Supervisor:
         if cell is not None:
             cell.k = self.bus_state(alarm.definition.name)
             self.board.queue(cell)
+        for node in self._nodes.values():
+            node.report(t_ns, *self._own_codes())
         broadcast = self._broadcasts.get(alarm.definition.message)
         if broadcast is not None:
             broadcast.expire(t_ns)
+
+    def _own_codes(self) -> tuple[list[tuple[int, int, int]], int]:
+        """The active alarms that have a trouble code, and the lamps: red for Critical, amber for other faults (J1939-73)."""
+        active = [alarm for alarm in self.catalog.alarms.values() if alarm.spn is not None and self.bus_state(alarm.name) != NORMAL]
+        codes = [(alarm.spn or 0, 31 if alarm.fmi is None else alarm.fmi, len(self._raised[alarm.name])) for alarm in active]
+        red = any(alarm.priority == PRIORITIES[-1] for alarm in active)
+        return codes, (0x10 if red else 0) | (0x04 if any(alarm.is_fault for alarm in active) else 0)
 
     def counted(self, alarm: AlarmMachine, t_ns: int) -> None:
         """An activation more."""
@@ -456,7 +517,7 @@ class Supervisor:
 
     def is_armed(self, alarm: AlarmMachine) -> bool:
         """Whether the configuration lets its repair act."""
-        return self.armed is None or alarm.definition.name in self.armed
+        return self.armed is None or alarm.definition.name in self.armed or alarm.definition.signal in self.armed
 
     def forbidden(self, repair: Repair) -> str:
         """Nothing moves while the unit is stopped or paused from above."""

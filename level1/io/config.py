@@ -42,6 +42,8 @@ class Bus(msgspec.Struct, frozen=True):
     """A CAN bus. interface, channel, bitrate, fd: as python-can takes them; options: further arguments of it.
 
     dbc: files bound to this bus; a name that is no file beside the configuration is one of the shipped definitions.
+    j1939: source address that the UCS claims on this bus (128 to 247 are for nodes that choose by themselves); without it the
+    UCS claims none and reports no trouble codes of its own there.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Bus(msgspec.Struct, frozen=True):
     interface: str = "socketcan"
     bitrate: int | None = None
     fd: bool = False
+    j1939: int | None = None
     options: dict[str, Any] = {}
 
 
@@ -98,6 +101,11 @@ class Config(msgspec.Struct, frozen=True):
     path: str = ""
 
     @property
+    def j1939(self) -> dict[int, int]:
+        """Index of each bus on which the UCS claims a J1939 address -> that address."""
+        return {index: bus.j1939 for index, bus in enumerate(self.bus) if bus.j1939 is not None}
+
+    @property
     def bus_names(self) -> tuple[str, ...]:
         """Names of the buses, by index."""
         return tuple(bus.name for bus in self.bus)
@@ -134,10 +142,11 @@ def parse(table: Mapping[str, Any], path: str) -> Config:
 def check_armed(config: Config, catalog: Catalog) -> None:
     """Check that every armed name is an alarm with a repair. Raises ConfigError with every one that is not."""
     repairable = [name for name, alarm in catalog.alarms.items() if alarm.repair]
+    repairable += [alarm.signal for alarm in catalog.alarms.values() if alarm.repair]
     problems = []
     for index, name in enumerate(config.repairs.armed):
         where = f"{config.path}: repairs.armed[{index}]"
-        if name not in catalog.alarms:
+        if name not in catalog.alarms and name not in repairable:
             problems.append(f'{where}: no alarm is called "{name}"{did_you_mean(name, repairable)}')
         elif name not in repairable:
             problems.append(f'{where}: the alarm "{name}" has no repair; take it out of the list')
@@ -241,6 +250,10 @@ def _rule_problems(table: Mapping[str, Any]) -> Iterator[str]:
 def _bus_problems(buses: Any) -> Iterator[str]:
     if not isinstance(buses, list):
         return
+    for index, bus in enumerate(buses):
+        address = bus.get("j1939") if isinstance(bus, dict) else None
+        if isinstance(address, int) and not 0 <= address <= 253:
+            yield f"bus[{index}].j1939: {address} is no source address; take one of 0 to 253, best of 128 to 247"
     if not buses:
         yield "bus: no bus; add a [[bus]] table with name, channel and dbc"
     tables = [bus if isinstance(bus, Mapping) else {} for bus in buses]
