@@ -11,7 +11,6 @@ now and then which messages may fall silent before it looks again, and gives onl
 """
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -23,10 +22,10 @@ from level1.decode import (
     OLD,
     SHORT,
     Classes,
+    FloatClasses,
     RawValue,
     Scale,
     compile_handler,
-    float_quality,
     raw_of,
 )
 from level1.frame import BUS_SHIFT, EXTENDED, REMOTE, frame_key, j1939_pgn
@@ -92,6 +91,20 @@ class Cell:
         if self.k >= self.base:
             return self.k - self.base
         return self.classes.quality[self.k]
+
+    def set_class(self, raw: RawValue) -> None:
+        """Put a signal into the class of a raw value."""
+        classes = self.classes
+        k = self.k = classes.of(raw)
+        self.lo, self.hi = classes.low[k], classes.high[k]
+
+    def set_value(self, raw: RawValue) -> None:
+        """Give an exact signal a raw value."""
+        classes = self.classes
+        k = self.k = classes.of(raw)
+        self.lo = self.hi = self.raw = raw
+        self.bad = BAD[classes.quality[k]]
+        self.value = self.scale.physical(raw)
 
 
 class Page:
@@ -259,6 +272,10 @@ class Tap:
                 page.receive(t_ns, data)
         self.handle = handle
 
+    def receive(self, t_ns: int, data: bytes) -> None:
+        """A frame of this identifier."""
+        self.handle(t_ns, data)
+
     def heard(self) -> None:
         """A tap never counts as silent."""
 
@@ -421,8 +438,11 @@ class Board:
     def set_classes(self, thresholds: dict[str, set[Any]]) -> None:
         """Cut the raw values of every signal in use by the constants it is compared with (cell name -> constants)."""
         for name, cell in self.cells.items():
-            cell.classes = Classes(cell.signal, cell.message.j1939, () if cell.exact else thresholds.get(name, ()))
-            cell.base = 2 if cell.signal.is_float else len(cell.classes.low)
+            if cell.signal.is_float:
+                cell.classes = FloatClasses(cell.signal)
+            else:
+                cell.classes = Classes(cell.signal, cell.message.j1939, () if cell.exact else thresholds.get(name, ()))
+            cell.base = len(cell.classes.quality)
             cell.k = cell.base + NEVER
             cell.bad = BAD[NEVER]
             if cell.held is not None:
@@ -462,8 +482,9 @@ class Board:
         """Make the decoders and the table of identifiers. After this the set of cells is fixed."""
         for page in [*self.pages.values(), *self.branches.values()]:
             every = {cell.signal.name for cell in page.cells if cell.rate is not None}
-            page.handle = compile_handler(page.message, [(cell.signal, cell) for cell in page.cells], self.touch,
-                                          self._short_of(page), every, page.select if page.branches else None)
+            page.handle = compile_handler(
+                page.message, [(cell.signal, cell, self.measure if cell.exact else self.touch) for cell in page.cells],
+                self._short_of(page), every, page.select if page.branches else None)
             if page.protection is not None and page.selector is None:
                 page.decode, page.handle = page.handle, page.check
         for name in self.pages:
@@ -484,10 +505,8 @@ class Board:
     def deliver(self, t_ns: int, key: int, data: bytes) -> None:
         """A message that came in several frames, as if it had come in one."""
         page = self.table[key] if key in self.table else self.bind(key)
-        if isinstance(page, Page):
+        if page is not None:
             page.receive(t_ns, data)
-        elif page is not None:
-            page.handle(t_ns, data)
 
     def bind(self, key: int) -> Page | Tap | None:
         """Find the page of an identifier heard for the first time, and remember it; None: no definition asks for it.
@@ -533,20 +552,19 @@ class Board:
         return None
 
     def touch(self, cell: Cell, raw: RawValue, t_ns: int) -> None:
-        """A signal has left its class (or, exact, its value; or every frame counts)."""
-        if not cell.exact:
-            self._classify(cell, raw)
-        else:
-            changed = cell.raw != raw or cell.k >= cell.base
-            self._take_value(cell, raw, self._classify(cell, raw))
-            if changed and cell.held is not None:
-                cell.held.restart(t_ns, cell.bad)
-            if cell.rate is not None:
-                cell.rate.sample(t_ns, cell.value, cell.bad)
-        for watch in cell.watches:
-            if not watch.queued:
-                watch.queued = True
-                self.queued.append(watch)
+        """A signal has left its class."""
+        cell.set_class(raw)
+        self.queue(cell)
+
+    def measure(self, cell: Cell, raw: RawValue, t_ns: int) -> None:
+        """An exact signal has another value, or has come again where every frame counts."""
+        changed = raw != cell.raw
+        cell.set_value(raw)
+        if changed and cell.held is not None:
+            cell.held.restart(t_ns, cell.bad)
+        if cell.rate is not None:
+            cell.rate.sample(t_ns, cell.value, cell.bad)
+        self.queue(cell)
 
     def place(self, page: Page, t_ns: int, data: bytes) -> None:
         """Bring a page up to a frame that changes nothing for anyone: neither conditions nor clocks are told."""
@@ -559,28 +577,10 @@ class Board:
                 cell.k = cell.base + SHORT
                 cell.lo, cell.hi, cell.raw = 1, 0, None
                 cell.bad = BAD[SHORT]
-                continue
-            quality = self._classify(cell, raw)
-            if cell.exact:
-                self._take_value(cell, raw, quality)
-
-    def _classify(self, cell: Cell, raw: RawValue) -> int:
-        """Put a cell into the class of a raw value, and give its quality."""
-        if cell.signal.is_float:
-            quality = float_quality(cell.signal, float(raw))
-            cell.k = 0 if quality == GOOD else 1
-            return quality
-        classes = cell.classes
-        k = cell.k = bisect_right(classes.cuts, raw)
-        if not cell.exact:
-            cell.lo, cell.hi = classes.low[k], classes.high[k]
-        return classes.quality[k]
-
-    @staticmethod
-    def _take_value(cell: Cell, raw: RawValue, quality: int) -> None:
-        cell.lo = cell.hi = cell.raw = raw
-        cell.bad = BAD[quality]
-        cell.value = cell.scale.physical(raw) if quality == GOOD else 0
+            elif cell.exact:
+                cell.set_value(raw)
+            else:
+                cell.set_class(raw)
 
     def spoil(self, cell: Cell, quality: int) -> None:
         """A signal has no raw value any more: NEVER, OLD, SHORT, CORRUPT or FROZEN."""
@@ -612,6 +612,8 @@ class Board:
                 raw = raw_of(cell.signal, data)
                 if raw is None:
                     self.spoil(cell, SHORT)
+                elif cell.exact:
+                    self.measure(cell, raw, t_ns)
                 else:
                     self.touch(cell, raw, t_ns)
             if page.branches:
@@ -658,5 +660,3 @@ def _unnoticed(key: int) -> None:
 
 def _index(watch: Watch) -> int:
     return watch.index
-
-

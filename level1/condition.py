@@ -310,8 +310,7 @@ class Compiler:
             return self._table(page.presence, [F] * (len(page.limits) + 1) + [T])
         cell = self.board.cell(node.message, node.signal)
         table = QUALITY_TABLES[node.kind]
-        known = (GOOD, ERROR) if cell.signal.is_float else cell.classes.quality
-        return self._table(cell, [table[quality] for quality in known] + list(table))
+        return self._table(cell, [table[quality] for quality in cell.classes.quality] + list(table))
 
     def _elapsed(self, node: Elapsed) -> str:
         limit = elapsed_limit(node)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import struct
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any
@@ -125,28 +125,34 @@ class Classes:
             return ERROR
         return GOOD
 
-    def of(self, raw: int) -> int:
+    def of(self, raw: RawValue) -> int:
         """Index of the class of a raw value."""
         return bisect_right(self.cuts, raw)
 
 
-def float_quality(signal: Signal, raw: float) -> int:
-    """Quality of an IEEE-754 sample: NaN, infinity and values outside the limits are errors."""
-    if not math.isfinite(raw):
-        return ERROR
-    physical = raw * float(signal.factor) + float(signal.offset)
-    if signal.minimum is not None and physical < signal.minimum:
-        return ERROR
-    if signal.maximum is not None and physical > signal.maximum:
-        return ERROR
-    return GOOD
+class FloatClasses(Classes):
+    """The two classes of an IEEE-754 signal: good; and NaN, infinite or outside the limits."""
+
+    __slots__ = ("signal",)
+
+    def __init__(self, signal: Signal):
+        self.signal = signal
+        self.cuts, self.low, self.high, self.sample = [], [], [], []
+        self.quality = [GOOD, ERROR]
+
+    def of(self, raw: RawValue) -> int:
+        """Index of the class of a raw value."""
+        if not math.isfinite(raw):
+            return 1
+        signal = self.signal
+        physical = raw * float(signal.factor) + float(signal.offset)
+        low = signal.minimum is not None and physical < signal.minimum
+        return int(low or (signal.maximum is not None and physical > signal.maximum))
 
 
 def quality_of(signal: Signal, j1939: bool, raw: RawValue) -> int:
     """GOOD, UNAVAILABLE or ERROR of one raw value; the slow way, for signals that no condition uses."""
-    if isinstance(raw, float):
-        return float_quality(signal, raw)
-    classes = Classes(signal, j1939, ())
+    classes = FloatClasses(signal) if signal.is_float else Classes(signal, j1939, ())
     return classes.quality[classes.of(raw)]
 
 
@@ -212,34 +218,34 @@ def _insert(payload: bytearray, signal: Signal, raw: int) -> None:
 
 
 Handler = Callable[[int, bytes], None]
+Touch = Callable[[Any, RawValue, int], None]
 
 
-def compile_handler(message: Message, signals: list[tuple[Signal, Any]], touch: Callable[[Any, RawValue, int], None],
-                    short: Handler, every: set[str], after: Handler | None) -> Handler:
+def compile_handler(message: Message, signals: Sequence[tuple[Signal, Any, Touch]], short: Handler, every: set[str],
+                    after: Handler | None) -> Handler:
     """The decoder of one message (or of one multiplexer page of it).
 
-    signals: each signal in use with its cell (`board.Cell`), whose present class is `lo <= raw <= hi`.
-    touch(cell, raw, t_ns) is called for each signal that has left its class, and at every frame for those named in `every`.
+    signals: each signal in use with its cell (`board.Cell`), whose present class is `lo <= raw <= hi`, and its touch:
+    touch(cell, raw, t_ns) is called when it has left its class, and at every frame for those named in `every`.
     short(t_ns, data) is called instead when the payload is too short for one of them. after(t_ns, data) comes last.
     """
     lines = ["def handle(t, d):"]
-    names: dict[str, Any] = {"touch": touch, "short": short, "after": after, "from_bytes": int.from_bytes,
-                             "unpack": struct.unpack_from}
-    need = max((last_byte(signal) + 1 for signal, _ in signals), default=0)
+    names: dict[str, Any] = {"short": short, "after": after, "from_bytes": int.from_bytes, "unpack": struct.unpack_from}
+    need = max((last_byte(signal) + 1 for signal, *_ in signals), default=0)
     if need:
         lines += [f" if len(d) < {need}:", "  short(t, d)", "  return"]
-    words = {signal.big_endian for signal, _ in signals if not signal.is_float and not _in_one_byte(signal)}
+    words = {signal.big_endian for signal, *_ in signals if not signal.is_float and _bytes_touched(signal) > 2}
     if False in words:
         lines.append(" x = from_bytes(d, 'little')")
     if True in words:
         lines.append(f" y = from_bytes(d if len(d) == {need} else d[:{need}], 'big')")
-    for number, (signal, cell) in enumerate(signals):
-        names[f"c{number}"] = cell
+    for number, (signal, cell, touch) in enumerate(signals):
+        names[f"c{number}"], names[f"touch{number}"] = cell, touch
         lines.append(f" r = {_extract(signal, need)}")
         if signal.name in every:
-            lines.append(f" touch(c{number}, r, t)")
+            lines.append(f" touch{number}(c{number}, r, t)")
         else:
-            lines.append(f" if not c{number}.lo <= r <= c{number}.hi: touch(c{number}, r, t)")
+            lines.append(f" if not c{number}.lo <= r <= c{number}.hi: touch{number}(c{number}, r, t)")
     if after is not None:
         lines.append(" after(t, d)")
     if len(lines) == 1:
@@ -250,14 +256,13 @@ def compile_handler(message: Message, signals: list[tuple[Signal, Any]], touch: 
     return handler
 
 
-def _in_one_byte(signal: Signal) -> bool:
-    if signal.is_float:
-        return False
+def _bytes_touched(signal: Signal) -> int:
     first = first_bit(signal)
-    return first // 8 == (first + signal.length - 1) // 8
+    return (first + signal.length - 1) // 8 - first // 8 + 1
 
 
 def _extract(signal: Signal, need: int) -> str:
+    """Source of a signal's raw value. A word of the payload is only made (x, y) for signals that touch more than two bytes."""
     n = signal.length
     mask = (1 << n) - 1
     if signal.is_float:
@@ -265,17 +270,16 @@ def _extract(signal: Signal, need: int) -> str:
             order = ">" if signal.big_endian else "<"
             return f"unpack('{order}{_FLOAT_FORMATS[n]}', d, {signal.start // 8})[0]"
         raise ValueError(f"{signal.name}: a float signal must start at a byte boundary")
-    if _in_one_byte(signal):
-        if signal.big_endian:
-            shift = 7 - _motorola_position(signal) % 8 - (n - 1)
-        else:
-            shift = signal.start % 8
-        source = f"d[{signal.start // 8}]"
-        width = 8
-    elif signal.big_endian:
-        shift, source, width = need * 8 - _motorola_position(signal) - n, "y", 0
+    first, width = first_bit(signal), need * 8 if signal.big_endian else 0
+    byte, touched = first // 8, _bytes_touched(signal)
+    if touched > 2:
+        source = "y" if signal.big_endian else "x"
     else:
-        shift, source, width = signal.start, "x", 0
+        first, width = first % 8, 8 * touched
+        source = f"d[{byte}]"
+        if touched == 2:
+            source = f"(d[{byte}] << 8 | d[{byte + 1}])" if signal.big_endian else f"(d[{byte}] | d[{byte + 1}] << 8)"
+    shift = width - first - n if signal.big_endian else first
     expression = f"{source} >> {shift}" if shift else source
     if width != shift + n:
         expression = f"({expression}) & {mask}" if shift else f"{expression} & {mask}"

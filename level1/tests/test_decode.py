@@ -33,7 +33,7 @@ def handled(signal: Signal, data: bytes) -> Any:
     seen: list[Any] = []
     cell: Any = type("Cell", (), {"lo": 1, "hi": 0})()
     message = Message("M", 1, False, 8, (signal,))
-    handle = compile_handler(message, [(signal, cell)], lambda cell, raw, t: seen.append(raw), lambda t, d: seen.append(None),
+    handle = compile_handler(message, [(signal, cell, lambda cell, raw, t: seen.append(raw))], lambda t, d: seen.append(None),
                              set(), None)
     handle(0, data)
     return seen[0]
