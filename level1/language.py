@@ -441,7 +441,8 @@ def _syntax_error(text: str, error: UnexpectedInput) -> LanguageError:
     if not text.strip():
         return LanguageError(1, "is empty", "say when it holds")
     if at_end:
-        return LanguageError(position + 1, f"ends too early: {_in_words(expected)} is missing")
+        missing = "`)`" if "RPAR" in expected and "NAME" not in expected else _in_words(expected)
+        return LanguageError(position + 1, f"ends too early: {missing} is missing")
     found = _word_at(text, position)
     return LanguageError(position + 1, f"`{found}` can't stand here, {_in_words(expected)} is expected",
                          _hint(text, position, expected))
@@ -467,8 +468,8 @@ def _expected(error: UnexpectedInput) -> frozenset[str]:
 
 _WORDS: tuple[tuple[str, str], ...] = (
     ("_SEND", "a step"), ("NUMBER", "a value"), ("NAME", "a name"), ("UNIT", "a unit (ms, s, min, h)"),
-    ("ARGUMENT", "a value"), ("_WITHIN", "`within` and a duration"), ("RPAR", "`)`"), ("EQUAL", "`=`"), ("COLON", "`:`"),
-    ("LPAR", "`(`"), ("SEMICOLON", "`;` or the end"), ("COMPARISON", "an operator"),
+    ("ARGUMENT", "a value"), ("_WITHIN", "`within` and a duration"), ("COMPARISON", "an operator"), ("RPAR", "`)`"),
+    ("EQUAL", "`=`"), ("COLON", "`:`"), ("LPAR", "`(`"), ("SEMICOLON", "`;` or the end"),
 )
 """The most telling of the words the grammar would take, in order."""
 

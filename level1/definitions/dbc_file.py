@@ -42,6 +42,8 @@ ANY_SOURCE = 0xFE
 """Source address in a J1939 identifier that stands for any (J1939-81: the null address; DESIGN §3)."""
 MAX_CYCLE_MS = 86_400_000
 """Longest cycle time taken seriously: a day."""
+CLASSIC_BYTES = 8
+"""Payload of a classic CAN frame; an 11-bit message with more can only be CAN FD, whatever VFrameFormat leaves out."""
 MAX_VIOLATIONS = 20
 """Exceeded limits told of one file; a hostile one may have thousands."""
 _END = "\nBS_:\n"
@@ -278,7 +280,8 @@ class _Reader:
             name=parsed.name, can_id=parsed.frame_id, extended=parsed.is_extended_frame, length=parsed.length, signals=signals,
             senders=tuple(parsed.senders), cycle_ns=self._cycle_ns(parsed, text), j1939=j1939,
             pgn=j1939_pgn(parsed.frame_id) if j1939 else None, source=source if j1939 and source != ANY_SOURCE else None,
-            is_fd=parsed.is_fd, comment=parsed.comment or "", file=self._path, line=text.line)
+            is_fd=parsed.is_fd or (not parsed.is_extended_frame and parsed.length > CLASSIC_BYTES),
+            comment=parsed.comment or "", file=self._path, line=text.line)
 
     def _cycle_ns(self, parsed: DbcMessage, text: MessageText) -> int | None:
         if not parsed.cycle_time:

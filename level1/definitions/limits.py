@@ -17,7 +17,7 @@ from level1.dbc_text import STRING, DbcText, EntryText, MessageText
 class Limit(Enum):
     """A bound: the largest value allowed, and why that one."""
 
-    CHARACTERS = 16_000_000, "100,000 lines take 8 million; cantools needs 70 bytes of memory a character"
+    CHARACTERS = 10_000_000, "100,000 lines take 8 million; cantools needs 70 bytes of memory a character"
     STRING = 65_536, "cantools needs 200 bytes of memory a character of a string"
     DIGITS = 400, "the largest double has 309 digits"
     EXPONENT_DIGITS = 3, "the largest double is 1.8e308; an integer attribute of 1e999999999 would fill the memory"

@@ -9,12 +9,15 @@ import msgspec
 from level1.catalog import Message, Problem, Signal
 from level1.decode import first_bit
 from level1.definitions.attributes import Place
-from level1.definitions.dbc_file import DbcFile
+from level1.definitions.dbc_file import CLASSIC_BYTES, DbcFile
 from level1.frame import frame_key
 from level1.protection import CHECKSUMS
 
 _TOPIC_LEVEL = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 """A name that can be a level of an MQTT topic (DESIGN §6)."""
+
+FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
+"""Payloads of a CAN FD frame above 8 bytes (ISO 11898-1)."""
 
 
 def place_of(file: DbcFile, message: Message, problems: list[Problem], signal: Signal | None = None) -> Place:
@@ -32,8 +35,17 @@ def unique(files: Sequence[DbcFile], problems: list[Problem]) -> list[tuple[DbcF
                 place_of(file, message, problems).note(
                     "", f"message name is used twice, first in {first.file}:{first.line}", "names must differ over all files")
             else:
+                _check_length(message, place_of(file, message, problems))
                 result[message.name] = file, _with_attributes(file, message, problems)
     return list(result.values())
+
+
+def _check_length(message: Message, place: Place) -> None:
+    """What UCS sends goes out as one frame."""
+    fd_lengths = FD_LENGTHS if not message.j1939 else ()
+    if message.sent_by_ucs and message.length > CLASSIC_BYTES and message.length not in fd_lengths:
+        place.note("", f"UCS can't send {message.length} bytes in one frame", f"at most {CLASSIC_BYTES}" + (
+            f", or with CAN FD {', '.join(map(str, FD_LENGTHS))}" if fd_lengths else ""))
 
 
 def _with_attributes(file: DbcFile, message: Message, problems: list[Problem]) -> Message:

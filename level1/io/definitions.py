@@ -27,7 +27,7 @@ CPU_BASE_S, CPU_BYTES_PER_S = 8, 100_000
 """Seconds of computing time of the child: a base, and one more for so many bytes. An honest file takes a fifth of that."""
 WALL_FACTOR = 6
 """The child may take so many times longer on a busy machine before it is given up."""
-MAX_FILE_BYTES = 16_000_000
+MAX_FILE_BYTES = 10_000_000
 """Size of a file above which it isn't even read; 100,000 lines take 8 MB."""
 
 _OUT_OF_MEMORY = 3

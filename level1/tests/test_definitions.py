@@ -472,6 +472,13 @@ def test_a_source_address_in_a_j1939_identifier_is_kept() -> None:
     assert result and (result.messages["EEC1"].pgn, result.messages["EEC1"].source) == (61444, 0)
 
 
+@pytest.mark.parametrize(("length", "told"), [(8, False), (12, False), (9, True), (64, False), (65, True)])
+def test_what_ucs_sends_fits_one_frame(length: int, told: bool) -> None:
+    result, problems = build([Source("tool.dbc", text().replace("CMD: 8 UCS", f"CMD: {length} UCS"))])
+    assert ["in one frame" in problem.message for problem in problems] == [True] * told
+    assert told or (result and result.messages["CMD"].is_fd == (length > 8))
+
+
 def test_multiplexed_signals() -> None:
     extra = ("BO_ 300 MUX: 8 TOOL\n SG_ Page M : 0|8@1+ (1,0) [0|0] \"\" UCS\n SG_ Sub m1M : 8|8@1+ (1,0) [0|0] \"\" UCS\n"
              " SG_ A m0 : 8|8@1+ (1,0) [0|0] \"\" UCS\n SG_ B m2 : 16|8@1+ (1,0) [0|0] \"\" UCS\n"

@@ -58,8 +58,8 @@ def test_all_shipped_files_fit_together() -> None:
 
 
 def test_files_are_bound_to_buses(tool: Path) -> None:
-    catalog = load((), {0: [tool], 1: ["ucs.dbc", tool]})
-    assert catalog.buses["STATUS"] == (0, 1) and len(catalog.files) == 2
+    catalog = examine((), {0: [tool], 1: ["ucs.dbc", tool]}).catalog
+    assert catalog and catalog.buses["STATUS"] == (0, 1) and len(catalog.files) == 2
     assert set(catalog.buses.values()) == {(0, 1), (1,)}
 
 
@@ -95,7 +95,7 @@ HOSTILE: dict[str, tuple[Callable[[], str | bytes], str]] = {
     "million bits": (lambda: 'BO_ 1 A: 8 X\n SG_ S : 0|1000000@1+ (1,0) [0|0] "" X\n', "1000000 bits from bit 0"),
     "more digits than any number": (lambda: f'BO_ 1 A: 8 X\n SG_ S : 0|{"9" * 30}@1+ (1,0) [0|0] "" X\n', "can't be read"),
     "comment of 20 MB": (lambda: ONE + 'CM_ "' + "x" * 20_000_000 + '";\n', "too large for a DBC file"),
-    "comment of 10 MB": (lambda: ONE + 'CM_ "' + "x" * 10_000_000 + '";\n', "a text of 10000000 characters is too long"),
+    "comment of 9 MB": (lambda: ONE + 'CM_ "' + "x" * 9_000_000 + '";\n', "a text of 9000000 characters is too long"),
     "string without end": (lambda: ONE + 'CM_ "' + '\\"' * 1_000_000, "is too long"),
     "forty million multiplexer values": (lambda: multiplexed(1, 40_000_000), "layouts, too many"),
     "multiplexers in multiplexers": (lambda: multiplexed(7, 255), "layouts, too many"),
