@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import struct
+from itertools import zip_longest
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -44,7 +45,7 @@ def test_silence_is_told_exactly_at_its_limit_however_messages_come(steps: list[
     out += target.tick(now + SECOND)
     expected = []
     for name, stamps in heard.items():
-        for last, following in zip(stamps, [*stamps[1:], None], strict=True):
+        for last, following in zip_longest(stamps, stamps[1:]):
             if following is None or following - last >= limit_ms * MS:
                 expected.append(((last + limit_ms * MS) / SECOND, f"{name}_SILENT", "raised"))
                 if following is not None:
