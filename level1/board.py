@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from operator import attrgetter
 from typing import Any
 
 from level1.catalog import STALE_CYCLES, Catalog, Message, Signal
@@ -42,18 +43,19 @@ MAX_KEYS = 65_536
 MAX_ROUNDS = 64
 """Rounds of evaluation at one instant before conditions that feed each other are left for the next input."""
 
+_index = attrgetter("index")
+
 
 class Watch:
     """A compiled condition in use. evaluate(): its present outcome, a small integer; sink(t_ns, outcome): told when it changes."""
 
-    __slots__ = ("evaluate", "index", "outcome", "queued", "sink")
+    __slots__ = ("evaluate", "index", "outcome", "sink")
 
     def __init__(self, index: int, evaluate: Callable[[], int], sink: Callable[[int, int], None], outcome: int):
         self.index = index
         self.evaluate = evaluate
         self.sink = sink
         self.outcome = outcome
-        self.queued = False
 
 
 class Cell:
@@ -141,16 +143,14 @@ class Page:
         self.watchdog: Watchdog | None = None
 
     def receive(self, t_ns: int, data: bytes) -> None:
-        """A frame of this message; `Board.receive_many` has the same in line."""
+        """A frame of this message; `Supervisor.receive_many` has the same in line."""
+        self.t_ns = t_ns
         if self.seen != data:
-            self.t_ns = t_ns
             if self.seen is None:
                 self.heard()
             self.data = data
             self.seen = ALWAYS if self.always else data
             self.handle(t_ns, data)
-        else:
-            self.t_ns = t_ns
 
     def heard(self) -> None:
         """First frame, or first after a silence."""
@@ -375,7 +375,7 @@ class Board:
         self.table: dict[int, Page | Tap | None] = {}
         self.listeners: dict[int, Callable[[int, int, bytes], None]] = {}
         self.newcomer: Callable[[int], None] = _unnoticed
-        self.queued: list[Watch] = []
+        self.queued: list[Cell] = []
         self.watches = 0
         self.refresh: Callable[[Page], None] = _as_it_is
         self._by_key: dict[int, list[str]] = {}
@@ -554,7 +554,7 @@ class Board:
     def touch(self, cell: Cell, raw: RawValue, t_ns: int) -> None:
         """A signal has left its class."""
         cell.set_class(raw)
-        self.queue(cell)
+        self.queued.append(cell)
 
     def measure(self, cell: Cell, raw: RawValue, t_ns: int) -> None:
         """An exact signal has another value, or has come again where every frame counts."""
@@ -564,7 +564,7 @@ class Board:
             cell.held.restart(t_ns, cell.bad)
         if cell.rate is not None:
             cell.rate.sample(t_ns, cell.value, cell.bad)
-        self.queue(cell)
+        self.queued.append(cell)
 
     def place(self, page: Page, t_ns: int, data: bytes) -> None:
         """Bring a page up to a frame that changes nothing for anyone: neither conditions nor clocks are told."""
@@ -622,26 +622,28 @@ class Board:
 
     def queue(self, cell: Cell) -> None:
         """Have the conditions that read a cell evaluated at the next `settle`."""
-        for watch in cell.watches:
-            if not watch.queued:
-                watch.queued = True
-                self.queued.append(watch)
+        self.queued.append(cell)
 
     def settle(self, t_ns: int) -> None:
         """Evaluate what is queued, in a fixed order, until nothing moves any more."""
         queued = self.queued
-        for _ in range(MAX_ROUNDS):
-            if not queued:
-                return
-            batch = sorted(queued, key=_index) if len(queued) > 1 else queued[:]
-            queued.clear()
+        rounds = 0
+        while queued:
+            if len(queued) == 1:
+                batch = queued.pop().watches
+            else:
+                batch = sorted({watch for cell in queued for watch in cell.watches}, key=_index)
+                queued.clear()
             for watch in batch:
-                watch.queued = False
-                outcome = watch.evaluate()
+                evaluate = watch.evaluate  # by a local name: CPython finds what a slot holds slowly in a method call
+                outcome = evaluate()
                 if outcome != watch.outcome:
                     watch.outcome = outcome
                     watch.sink(t_ns, outcome)
-        self.counters["conditions that feed each other"] += 1
+            rounds += 1
+            if rounds == MAX_ROUNDS:
+                self.counters["conditions that feed each other"] += 1
+                return
 
     # --- asking -----------------------------------------------------------------------------------------------------------
 
@@ -656,7 +658,3 @@ class Board:
 
 def _unnoticed(key: int) -> None:
     return None
-
-
-def _index(watch: Watch) -> int:
-    return watch.index

@@ -56,7 +56,6 @@ PROTOCOL_LIFE_NS = 100_000_000
 UNTOLD = -1
 """Outcome of a condition before its first evaluation: whatever it is then, its alarm is told."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_MISSING: Any = object()
 
 
 MAX_INSTANCES = 256
@@ -143,12 +142,20 @@ class Supervisor:
 
     def receive(self, frame: Frame) -> Sequence[Output]:
         """One frame, with everything that was due before it."""
-        return self.receive_many((frame,))
+        t, key, data = frame
+        page = self.board.table.get(key)
+        if page is None or not self._begun or not self.now_ns <= t < self.timers.next_ns:
+            return self.receive_many((frame,))
+        self.now_ns = t
+        page.receive(t, data)
+        if self.board.queued:
+            self.board.settle(t)
+        return self._take() if self._out else ()
 
     def receive_many(self, frames: Iterable[tuple[int, int, bytes]]) -> list[Output]:
         """Frames in order; the same as `receive` for each, without its cost a call."""
         board, timers = self.board, self.timers
-        get, bind, queued, settle = board.table.get, board.bind, board.queued, board.settle
+        table, bind, queued, settle = board.table, board.bind, board.queued, board.settle
         last = self.now_ns
         if not self._begun:
             frames, last = self._begin_with(frames)
@@ -159,25 +166,23 @@ class Supervisor:
                     t = last
                 self._pass_time(t)
             last = t
-            page = get(key, _MISSING)
-            if page is None:
-                continue
-            if page is _MISSING:
+            try:
+                page = table[key]
+            except KeyError:
                 self._heard_ns = t
                 page = bind(key)
-                if page is None:
-                    continue
+            if page is None:
+                continue
+            page.t_ns = t
             if page.seen != data:
-                page.t_ns = t
                 if page.seen is None:
                     page.heard()
                 page.data = data
                 page.seen = ALWAYS if page.always else data
-                page.handle(t, data)
+                handle = page.handle  # by a local name: CPython finds what a slot holds slowly in a method call
+                handle(t, data)
                 if queued:
                     settle(t)
-            else:
-                page.t_ns = t
         self.now_ns = last
         return self._take()
 
@@ -269,10 +274,12 @@ class Supervisor:
 
     def _pass_time(self, now_ns: int) -> None:
         """Everything due up to now, each at its own time."""
+        queued = self.board.queued
         while (item := self.timers.pop(now_ns)) is not None:
             due = self.timers.popped_ns
             item.expire(due)
-            self.board.settle(due)
+            if queued:
+                self.board.settle(due)
 
     def _begin(self, t_ns: int) -> None:
         """The first input: the time line begins, and conditions that hold without any frame are told."""
@@ -282,9 +289,9 @@ class Supervisor:
         start = self.now_ns
         if self._restored is not None:
             self._restore(self._restored, start)
-        for watch in self._watches:
-            watch.queued = True
-        self.board.queued.extend(self._watches)
+        everything = Cell("everything", 0)
+        everything.watches = self._watches
+        self.board.queue(everything)
         self.board.settle(start)
         for node in self._nodes.values():
             node.start(start)
