@@ -253,7 +253,7 @@ class Watchdog:
 
 
 class Tap:
-    """Listens to every frame of a parameter group and hands it on to the page of the identifier, if it has one.
+    """Listens to every frame of a parameter group or identifier and hands it on to the page of the identifier, if it has one.
 
     It stands in the table of identifiers like a page that decodes every frame.
     """
@@ -374,6 +374,7 @@ class Board:
         self.branches: dict[tuple[str, str, tuple[int, ...]], Page] = {}
         self.table: dict[int, Page | Tap | None] = {}
         self.listeners: dict[int, Callable[[int, int, bytes], None]] = {}
+        self.identifiers: dict[int, Callable[[int, int, bytes], None]] = {}
         self.newcomer: Callable[[int], None] = _unnoticed
         self.queued: list[Cell] = []
         self.watches = 0
@@ -502,6 +503,16 @@ class Board:
         """Have listener(t_ns, key, data) called for every frame of a J1939 parameter group."""
         self.listeners[pgn] = listener
 
+    def listen_to(self, can_id: int, listener: Callable[[int, int, bytes], None]) -> None:
+        """The same for every data frame of an 11-bit identifier, on any bus."""
+        self.identifiers[can_id] = listener
+
+    def listener(self, key: int) -> Callable[[int, int, bytes], None] | None:
+        """Who listens to all data frames of an identifier, besides its page."""
+        if key & (REMOTE | ERROR_FRAME):
+            return None
+        return self.listeners.get(j1939_pgn(key & 0x1FFF_FFFF)) if key & EXTENDED else self.identifiers.get(key & 0x7FF)
+
     def deliver(self, t_ns: int, key: int, data: bytes) -> None:
         """A message that came in several frames, as if it had come in one."""
         page = self.table[key] if key in self.table else self.bind(key)
@@ -516,10 +527,9 @@ class Board:
         """
         self.newcomer(key)
         page: Page | Tap | None = self._find(key)
-        if key & EXTENDED and not key & (REMOTE | ERROR_FRAME):
-            listener = self.listeners.get(j1939_pgn(key & 0x1FFF_FFFF))
-            if listener is not None:
-                page = Tap(key, listener, page if isinstance(page, Page) else None)
+        listener = self.listener(key)
+        if listener is not None:
+            page = Tap(key, listener, page if isinstance(page, Page) else None)
         if page is None:
             self.counters["ids nobody asks for"] += 1
             if len(self.table) >= MAX_KEYS:
