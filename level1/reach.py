@@ -2,9 +2,9 @@
 
 Theory of operation. A condition is taken apart into comparisons; each is a *question* about one *quantity* (a signal, a sum,
 an age, …), which lies in a known interval. Only the values around the limits it is compared with matter, so a few *probes*
-stand for all the rest. A quantity asked about once can answer independently of the others; those asked about more than once
-are tried value by value, so that `x > 5 and x < 3` is seen through. What is not understood counts as possible: a condition
-said to be impossible is impossible, one said to be possible may not be.
+stand for all the rest. Parts that ask about different quantities answer independently of each other; where they ask about the
+same, its probes are tried one by one, so that `x > 5 and x < 3` is seen through. What is not understood counts as possible: a
+condition said to be impossible is impossible, one said to be possible may not be.
 Values that J1939 reserves or the limits exclude never decide a comparison (DESIGN §4: STALE, ERROR), so they don't count here.
 """
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -39,7 +39,7 @@ from level1.expression import (
 from level1.scaling import physical, plain
 
 MAX_TRIES = 20_000
-"""Combinations of probes tried; beyond it quantities asked about more than once count as independent."""
+"""Comparisons worked out for one condition; beyond it parts count as independent."""
 
 Messages = Mapping[str, Message]
 
@@ -110,19 +110,7 @@ def interval(node: Expression, messages: Messages) -> Interval:
 
 def verdicts(node: Expression, messages: Messages) -> frozenset[bool]:
     """The verdicts a condition can come to while its inputs are good: TRUE, FALSE or both."""
-    questions = list(_questions(node))
-    probes = _probes(questions, messages)
-    asked = Counter(question.quantity for question in questions)
-    shared = [quantity for quantity, times in asked.items() if times > 1]
-    if math.prod(len(probes[quantity]) for quantity in shared) > MAX_TRIES:
-        shared = []
-    found: set[bool] = set()
-    for values in itertools.product(*(probes[quantity] for quantity in shared)):
-        known = {quantity: (value,) for quantity, value in zip(shared, values, strict=True)}
-        found |= _possible(node, {**probes, **known})
-        if len(found) == 2:
-            break
-    return frozenset(found)
+    return _Search(node, messages).verdicts(node, {})
 
 
 def overlap(first: Expression, second: Expression, messages: Messages) -> bool:
@@ -233,19 +221,67 @@ def _around(limits: set[Fraction], bounds: Interval) -> tuple[Fraction, ...]:
     return tuple(value for value in sorted({*ordered, *between, *beyond}) if value in bounds)
 
 
-def _possible(node: Expression, probes: _Probes) -> frozenset[bool]:
-    """Verdicts of a part, each of its quantities taking any of its probes on its own."""
-    match node:
-        case Boolean(value=value):
-            return frozenset((value,))
-        case Not(item=item):
-            return frozenset(not value for value in _possible(item, probes))
-        case And(items=items):
-            return _junction([_possible(item, probes) for item in items], True)
-        case Or(items=items):
-            return _junction([_possible(item, probes) for item in items], False)
-    question = _question(node)
-    return frozenset(question.answer(value) for value in probes[question.quantity])
+class _Search:
+    """Looks for the verdicts of one condition. Parts that ask about nothing in common are worked out one by one; where parts
+    ask about the same, each probe of what they ask about most is tried in turn, which parts them further."""
+
+    def __init__(self, node: Expression, messages: Messages):
+        questions = list(_questions(node))
+        self._probes = _probes(questions, messages)
+        self._question = {id(question.node): question for question in questions}
+        self._asked: dict[int, Counter[Hashable]] = {}
+        self._tries = 0
+
+    def verdicts(self, node: Expression, known: _Probes) -> frozenset[bool]:
+        """Verdicts of a part, some quantities being known."""
+        match node:
+            case Boolean(value=value):
+                return frozenset((value,))
+            case Not(item=item):
+                return frozenset(not value for value in self.verdicts(item, known))
+            case And(items=items):
+                return _junction([self._connected(part, True, known) for part in self._parts(items, known)], True)
+            case Or(items=items):
+                return _junction([self._connected(part, False, known) for part in self._parts(items, known)], False)
+        question = self._question[id(node)]
+        self._tries += 1
+        return frozenset(map(question.answer, known.get(question.quantity) or self._probes[question.quantity]))
+
+    def _connected(self, items: list[Expression], neutral: bool, known: _Probes) -> frozenset[bool]:
+        """Verdicts of parts that hang together by what they ask about."""
+        if len(items) == 1 or self._tries > MAX_TRIES:
+            return _junction([self.verdicts(item, known) for item in items], neutral)
+        quantity = self._most_asked(items, known)
+        found: set[bool] = set()
+        for value in self._probes[quantity]:
+            tried = {**known, quantity: (value,)}
+            found |= _junction([self._connected(part, neutral, tried) for part in self._parts(items, tried)], neutral)
+            if len(found) == 2:
+                break
+        return frozenset(found)
+
+    def _parts(self, items: Iterable[Expression], known: _Probes) -> list[list[Expression]]:
+        """The items in groups that ask about nothing unknown in common."""
+        groups: list[tuple[set[Hashable], list[Expression]]] = []
+        for item in items:
+            asked = {quantity for quantity in self._quantities(item) if quantity not in known}
+            together = [group for group in groups if group[0] & asked]
+            groups = [group for group in groups if not group[0] & asked]
+            joined = [one for group in together for one in group[1]]
+            groups.append((asked.union(*(group[0] for group in together)), [*joined, item]))
+        return [group[1] for group in groups]
+
+    def _most_asked(self, items: list[Expression], known: _Probes) -> Hashable:
+        asked: Counter[Hashable] = Counter()
+        for item in items:
+            asked.update(quantity for quantity in self._quantities(item) if quantity not in known)
+        return asked.most_common(1)[0][0]
+
+    def _quantities(self, node: Expression) -> Counter[Hashable]:
+        """What a part asks about, and how often."""
+        if id(node) not in self._asked:
+            self._asked[id(node)] = Counter(question.quantity for question in _questions(node))
+        return self._asked[id(node)]
 
 
 def _junction(parts: list[frozenset[bool]], neutral: bool) -> frozenset[bool]:
