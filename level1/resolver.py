@@ -43,6 +43,8 @@ from level1.scaling import exact_decimal, float_bits, physical, plain
 
 STATES: Mapping[str, int] = {"Normal": NORMAL, "Active": ACTIVE, "Repairing": REPAIRING, "LockedOut": LOCKED_OUT}
 """Names of an alarm's states (DESIGN §3)."""
+MOST_SUGGESTIONS = 10
+"""Mistakes of one text for which a similar name is looked up: it costs a look at every signal."""
 MAX_SPN = 524_287
 """Largest suspect parameter number: 19 bits (SAE J1939-73)."""
 MAX_FMI = 31
@@ -232,7 +234,7 @@ class _Resolution:
 
     def _unknown(self, name: Name) -> Typed:
         if not name.owner:
-            hint = similar.hint(name.text, self.scope.signal_names)
+            hint = similar.hint(name.text, self.scope.signal_names) if len(self.findings) < MOST_SUGGESTIONS else ""
             return self.error(name, f"there is no signal `{name.text}`", hint or "value names need the signal on the other side")
         message = self.scope.messages.get(name.owner)
         if message is None:
@@ -339,6 +341,8 @@ class _Resolution:
         for side in (left, right):
             if isinstance(side, Name) and (side.owner or self.scope.find(side) or side.text in self.scope.messages):
                 return side
+        if len(self.findings) >= MOST_SUGGESTIONS:
+            return left
         near = [side for side in (left, right)
                 if isinstance(side, Name) and similar.closest(side.text, self.scope.signal_names)]
         return near[0] if near else left
