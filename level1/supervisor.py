@@ -6,7 +6,7 @@ it comes frame by frame or in batches. A time stamp that runs backwards is clamp
 """
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
@@ -121,7 +121,8 @@ class Supervisor:
         self._alarms = {name: AlarmMachine(alarm, self, self.timers) for name, alarm in catalog.alarms.items()}
         self._reported: dict[str, dict[str, AlarmMachine]] = {name: {} for name in catalog.alarms}
         self._codes: dict[int, dict[str, TroubleCodeReport]] = {}
-        self._raised: dict[str, deque[int]] = {name: deque() for name in catalog.alarms}
+        self._raised: dict[str, deque[int]] = {}
+        self._activations: Counter[str] = Counter()
         self._counts: list[_Window] = []
         self._holds: dict[str, _Hold] = {}
         self._inputs: dict[str, list[tuple[str, Callable[[int], Any]]]] = {}
@@ -208,7 +209,7 @@ class Supervisor:
     def state(self) -> State:
         """What to store for the next start."""
         return State(self.mode, tuple(self._memory(alarm) for alarm in self._machines()
-                                      if alarm.state != NORMAL or self._raised[alarm.definition.name] or self._begun_of(alarm)))
+                                      if alarm.state != NORMAL or self._raised.get(alarm.definition.name) or self._begun_of(alarm)))
 
     def alarm_states(self) -> dict[str, int]:
         """Present state of every alarm: 0 Normal, 1 Active, 2 Repairing, 3 LockedOut."""
@@ -326,6 +327,7 @@ class Supervisor:
             if alarm.repair is not None:
                 self._compile_repair(machine, alarm.repair, compiler)
         for (name, window_ns), cell in things.counts.items():
+            self._raised.setdefault(name, deque())
             self._counts.append(_Window(self, name, window_ns, cell))
         if TROUBLE_CODE in self._alarms or things.codes or self._nodes:
             self._listen(Transport(board.deliver, self.counters))
@@ -511,13 +513,16 @@ class Supervisor:
     def _own_codes(self) -> tuple[list[tuple[int, int, int]], int]:
         """The active alarms that have a trouble code, and the lamps: red for Critical, amber for other faults (J1939-73)."""
         active = [alarm for alarm in self.catalog.alarms.values() if alarm.spn is not None and self.bus_state(alarm.name) != NORMAL]
-        codes = [(alarm.spn or 0, 31 if alarm.fmi is None else alarm.fmi, len(self._raised[alarm.name])) for alarm in active]
+        codes = [(alarm.spn or 0, 31 if alarm.fmi is None else alarm.fmi, self._activations[alarm.name]) for alarm in active]
         red = any(alarm.priority == PRIORITIES[-1] for alarm in active)
         return codes, (0x10 if red else 0) | (0x04 if any(alarm.is_fault for alarm in active) else 0)
 
     def counted(self, alarm: AlarmMachine, t_ns: int) -> None:
         """An activation more."""
-        self._raised[alarm.definition.name].append(t_ns)
+        name = alarm.definition.name
+        self._activations[name] += 1
+        if name in self._raised:
+            self._raised[name].append(t_ns)
         for window in self._counts:
             if window.alarm == alarm.definition.name:
                 window.expire(t_ns)
@@ -704,7 +709,7 @@ class Supervisor:
         now = self.now_ns
         return AlarmMemory(name, alarm.state, alarm.instance, alarm.acknowledged, repair.attempt if repair is not None else 0,
                            tuple(now - begun for begun in self._begun_of(alarm)),
-                           tuple(now - raised for raised in self._raised[name]) if not alarm.key else (),
+                           tuple(now - raised for raised in self._raised.get(name, ())) if not alarm.key else (),
                            alarm.key, alarm.detail, alarm.text if alarm.key else "")
 
     def _restore(self, state: State, now_ns: int) -> None:
@@ -716,7 +721,8 @@ class Supervisor:
             if memory.key:
                 machine = self._instance(memory.name, memory.key, memory.detail, memory.text)
                 self._reported[memory.name][memory.key] = machine
-            self._raised[memory.name].extend(now_ns - ago for ago in memory.raised_ago_ns)
+            if memory.name in self._raised:
+                self._raised[memory.name].extend(now_ns - ago for ago in memory.raised_ago_ns)
             machine.state = memory.state
             machine.zone = Zone.STALE
             machine.instance = memory.instance
