@@ -8,11 +8,13 @@ makes a `RunLink`, the bridge a `BridgeLink`; either may start first, end, and s
                    Beside     events that the journal can't take now (`Journal.pending`): they leave all the same
                    Answer     the result of an order
     bridge → run   Instruct   an order that passed the gate
+                   Refusal    somebody commanded who may not: supervision makes an alarm of it
 """
 from __future__ import annotations
 
 import os
 import socket
+from collections import deque
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -23,6 +25,7 @@ from level1.event import Event, Monitor, Result
 
 DATAGRAM_BYTES = 100_000
 """A Unix datagram may have about 200 kB."""
+REFUSALS = 100
 RECEIVE = 100
 """Datagrams taken in one call."""
 
@@ -55,8 +58,16 @@ class Instruct(msgspec.Struct, frozen=True, tag=True):
     order: Order
 
 
+class Refusal(msgspec.Struct, frozen=True, tag=True):
+    """Commands from above were refused by the gate. key: who signed, as far as that is known; count: since the last one told."""
+
+    reason: str
+    key: str
+    count: int
+
+
 FromRun = Poke | Samples | Beside | Answer
-FromBridge = Instruct
+FromBridge = Instruct | Refusal
 T = TypeVar("T")
 
 _encoder = msgspec.json.Encoder(decimal_format="number")
@@ -85,7 +96,7 @@ class _End(Generic[T]):
         """Readable when something came."""
         return self._socket.fileno()
 
-    def receive(self) -> list[T]:
+    def _receive(self) -> list[T]:
         """What came; malformed datagrams are counted and left out."""
         found: list[T] = []
         for _ in range(RECEIVE):
@@ -127,10 +138,20 @@ class _End(Generic[T]):
 
 
 class RunLink(_End[FromBridge]):
-    """The end of `ucs run`. `receive` gives orders. Raises OSError where the folder can't be written."""
+    """The end of `ucs run`. Raises OSError where the folder can't be written.
+
+    refusals: told by the gate and not yet taken, the newest `REFUSALS`.
+    """
 
     def __init__(self, journal: Path):
         super().__init__(journal, "run", "bridge", msgspec.json.Decoder(FromBridge))
+        self.refusals: deque[Refusal] = deque(maxlen=REFUSALS)
+
+    def receive(self) -> list[Instruct]:
+        """The orders that came; refusals that came with them are put with the others."""
+        messages = self._receive()
+        self.refusals.extend(message for message in messages if isinstance(message, Refusal))
+        return [message for message in messages if isinstance(message, Instruct)]
 
     def poke(self) -> bool:
         """Tell that the journal has news."""
@@ -155,9 +176,17 @@ class BridgeLink(_End[FromRun]):
     def __init__(self, journal: Path):
         super().__init__(journal, "bridge", "run", msgspec.json.Decoder(FromRun))
 
+    def receive(self) -> list[FromRun]:
+        """What came."""
+        return self._receive()
+
     def instruct(self, order: Order) -> bool:
         """Hand over an order; False when `ucs run` isn't there, which the sender has to be told."""
         return self._send(Instruct(order))
+
+    def refuse(self, reason: str, key: str, count: int) -> bool:
+        """Tell that commands were refused."""
+        return self._send(Refusal(reason, key, count))
 
 
 def _name(journal: Path, end: str) -> str:

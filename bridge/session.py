@@ -19,6 +19,8 @@ import msgspec
 from bridge import wire
 from bridge.clock import Clock
 from bridge.delivered import Delivered, delivered_path
+from bridge.gate import Decision, Gate, Passed, Refused, commands_path
+from bridge.keys import KeyRing
 from bridge.link import Answer, Beside, BridgeLink, Samples
 from bridge.mqtt import Address, MqttConnection, MqttError, Received, Tls, Waker
 from bridge.outbox import BACKLOG_PER_S, RETRY_NS, WINDOW, Outbox, Verdict
@@ -33,6 +35,15 @@ ALIVE_NS = 2_000_000_000
 CONNECT_NS = 500_000_000
 """Pause before the next attempt to connect; doubled up to `CONNECT_LONGEST_NS`, give or take half."""
 CONNECT_LONGEST_NS = 30_000_000_000
+ANSWER_NS = 5_000_000_000
+"""Patience with supervision's answer to an order."""
+STRANGERS_NS = 200_000_000
+"""Pause between answers to senders without a key."""
+UNKNOWN = "whether it was obeyed is not known"
+REFUSAL_NS = 500_000_000
+"""Pause between tellings of refusals to supervision."""
+REFUSALS = 20
+"""Kinds of refusals told at a time."""
 JOURNAL_NS = 500_000_000
 """How often a missing journal is looked for."""
 
@@ -40,7 +51,8 @@ JOURNAL_NS = 500_000_000
 class Settings(msgspec.Struct, frozen=True):
     """What a bridge serves and where it leads. Names are checked by `wire.check_name`.
 
-    period_ns: of each monitoring message. The rest is for tests: see `Outbox`.
+    period_ns: of each monitoring message. keys: file of those who may command; without one nobody may. The rest
+    is for tests: see `Outbox`.
     """
 
     journal: Path
@@ -49,6 +61,7 @@ class Settings(msgspec.Struct, frozen=True):
     broker: Address
     tls: Tls = Tls()
     period_ns: int = 250_000_000
+    keys: Path | None = None
     window: int = WINDOW
     retry_ns: int = RETRY_NS
     backlog_per_s: float = BACKLOG_PER_S
@@ -73,6 +86,12 @@ class Bridge:
         self._jitter = random.Random()
         self._said: set[str] = set()
         self._delivered = Delivered(delivered_path(settings.journal))
+        self._keys = KeyRing(settings.keys)
+        self._gate = Gate(commands_path(settings.journal), settings.fleet, settings.unit, self._keys.current(),
+                          self._clock.now_ns())
+        self._commands: dict[str, tuple[Passed, int]] = {}
+        self._answer_strangers_ns = self._refusal_ns = 0
+        self._refusals: Counter[tuple[str, str]] = Counter()
         self._link = BridgeLink(settings.journal)
         self._waker = Waker()
         self._stopping = False
@@ -224,6 +243,7 @@ class Bridge:
         if self._journal:
             self._journal.close()
         self._delivered.close()
+        self._gate.close()
         self._link.close()
         self._waker.close()
 
@@ -253,6 +273,8 @@ class Bridge:
         try:
             if kind == "ack":
                 self._acknowledge(wire.decode(message.payload, wire.Ack), outbox)
+            elif kind == "command":
+                self._command(message, now_ns)
         except wire.WireError as error:
             self._refuse(kind, f"malformed: {error}")
 
@@ -278,6 +300,62 @@ class Bridge:
             self._said.add(what)
             self._say(text)
 
+    # Commands
+
+    def _command(self, message: Received, now_ns: int) -> None:
+        self._gate.keys = self._keys.current()
+        if self._keys.fault:
+            self._say_once(self._keys.fault, self._keys.fault)
+        if message.retained:
+            decision: Decision = Refused("retained: it may be of any age")
+        else:
+            decision = self._gate.decide(message.payload, self._boot(), now_ns)
+        if isinstance(decision, Passed):
+            self._instruct(decision, now_ns)
+        elif isinstance(decision, Refused):
+            self._refuse_command(decision, now_ns)
+        elif decision.outcome:
+            self._publish_result(decision.id, decision.seq, decision.outcome, decision.reason)
+        elif not any(passed.id == decision.id for passed, _ in self._commands.values()):
+            self._publish_result(decision.id, decision.seq, "refused", f"handed to supervision before; {UNKNOWN}")
+
+    def _instruct(self, passed: Passed, now_ns: int) -> None:
+        self.counters["command passed"] += 1
+        self._commands[passed.order.id] = (passed, now_ns + ANSWER_NS)
+        if not self._link.instruct(passed.order):
+            self._answer(passed.order.id, "refused", "supervision is not running")
+
+    def _answer(self, id: str, outcome: str, reason: str) -> None:
+        """Supervision's answer, or the lack of one, to an order that passed."""
+        if found := self._commands.pop(id, None):
+            passed = found[0]
+            self._gate.remember(passed, outcome, reason)
+            self._publish_result(passed.id, passed.seq, outcome, reason)
+
+    def _refuse_command(self, refused: Refused, now_ns: int) -> None:
+        """Those with a key of ours get an answer each; strangers a few, lest they make us flood the network."""
+        self.counters["command refused"] += 1
+        self._say_once(f"command {refused.reason[:20]}",
+                       f"command from level 2 refused: {refused.reason} (told once, then counted)")
+        if len(self._refusals) < REFUSALS:
+            self._refusals[refused.reason, refused.key] += 1
+        if refused.known or now_ns >= self._answer_strangers_ns:
+            self._answer_strangers_ns = max(self._answer_strangers_ns, now_ns if refused.known else now_ns + STRANGERS_NS)
+            self._publish_result(refused.id, refused.seq, "refused", refused.reason)
+
+    def _publish_result(self, id: str, seq: int, outcome: str, reason: str) -> None:
+        self._publish("result", wire.Result(unit=self.settings.unit, boot=self._boot(), seq=seq, t=self._clock.t(),
+                                            utc=self._clock.utc(), utc_trusted=self._clock.trusted(), id=id,
+                                            outcome="done" if outcome == "done" else "refused", reason=reason[:1024]), qos=1)
+
+    def _tell_refusals(self, now_ns: int) -> None:
+        """Supervision makes alarms of refusals; it hears of them a few times a second at most."""
+        if self._refusals and now_ns >= self._refusal_ns:
+            self._refusal_ns = now_ns + REFUSAL_NS
+            for (reason, key), count in self._refusals.items():
+                self._link.refuse(reason, key, count)
+            self._refusals.clear()
+
     # What comes from `ucs run`
 
     def _hear_run(self, now_ns: int) -> None:
@@ -288,7 +366,10 @@ class Bridge:
             elif isinstance(message, Beside) and self._outbox:
                 self._outbox.unjournaled(event for event in message.events if event.unit == self.settings.unit)
             elif isinstance(message, Answer):
-                pass
+                self._answer(message.result.id, message.result.outcome, message.result.reason)
+        for id in [id for id, (_, due_ns) in self._commands.items() if due_ns <= now_ns]:
+            self._answer(id, "refused", f"no answer from supervision within {ANSWER_NS // 10**9} s; {UNKNOWN}")
+        self._tell_refusals(now_ns)
 
     def _is_supervising(self, now_ns: int) -> bool:
         return self._alive_ns is not None and now_ns - self._alive_ns < ALIVE_NS

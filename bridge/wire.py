@@ -23,6 +23,8 @@ PREFIX = ("ucs", "v1")
 PAYLOAD_BYTES = 65_536
 """A longer payload is refused unread; an alarm with a large freeze frame has some 4 kB."""
 NAME_BYTES = 64
+EXPONENT = 30
+"""Numbers beyond 10**30 or finer than 10**-30 are refused."""
 RANGES = 64
 """Ranges an acknowledgement names at most."""
 
@@ -188,6 +190,10 @@ def decode(payload: bytes, kind: type[M]) -> M:
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, ArithmeticError) as error:
         raise WireError(_too_new(payload) or str(error)) from None
     assert isinstance(message, kind)
+    for name in ("t", "value", "expires_t"):
+        number = getattr(message, name, None)
+        if isinstance(number, Decimal) and not _is_plain(number):
+            raise WireError(f"{name} is no plain number")
     return message
 
 
@@ -258,6 +264,12 @@ def _readable(schema: Any) -> Any:
         return {"type": "number"} | {key: schema[key] for key in schema.keys() - {"type", "format"}}
     return {key: inspect.cleandoc(item) if key == "description" and isinstance(item, str) else _readable(item)
             for key, item in schema.items()}
+
+
+def _is_plain(number: Decimal) -> bool:
+    """Whether a number can be printed and reckoned with: `1E999999999` would fill the memory with its digits."""
+    digits, exponent = number.as_tuple()[1:]
+    return isinstance(exponent, int) and -EXPONENT <= exponent <= EXPONENT and len(digits) <= 2 * EXPONENT
 
 
 def _too_new(payload: bytes) -> str:

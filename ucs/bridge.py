@@ -26,6 +26,7 @@ It needs [unit], [journal] and [bridge] in unit.toml, for example:
   ca = "ca.pem"                          # who signed the broker's certificate
   certificate = "unit.pem"               # ours, and its key
   key = "unit-key.pem"
+  keys = "keys.toml"                     # who may command, see `ucs keys`
 """
 
 
@@ -57,4 +58,4 @@ def settings_of(config: Config) -> Settings:
         raise ConfigError(f'{config.path}: bridge: missing; write [bridge] broker = "mqtt://host:1883"')
     bridge = config.bridge
     return Settings(Path(config.journal.path), config.unit.name, config.unit.fleet, parse_address(bridge.broker),
-                    Tls(bridge.ca, bridge.certificate, bridge.key), bridge.period_ns)
+                    Tls(bridge.ca, bridge.certificate, bridge.key), bridge.period_ns, Path(bridge.keys) if bridge.keys else None)

@@ -33,6 +33,7 @@ COMMANDS = {
     "simulate": Command("ucs.simulate", "simulate the nodes on the bus, with faults as a scenario says"),
     "bridge": Command("ucs.bridge", "carry a unit's events to level 2 and commands back"),
     "level2": Command("ucs.level2", "receive, store and acknowledge what units send"),
+    "keys": Command("ucs.keys", "make and list the keys of those who may command"),
     "journal": Command("ucs.journal", "list and export what a unit's journal holds"),
 }
 

@@ -118,6 +118,12 @@ def test_malformed_payloads_are_refused(payload: bytes) -> None:
         wire.decode(payload, wire.Ack)
 
 
+@pytest.mark.parametrize("number", ["1E999999999", "-1e400", "1E-999999999", "1" * 100])
+def test_numbers_that_would_fill_the_memory_are_refused(number: str) -> None:
+    with pytest.raises(wire.WireError, match="t is no plain number"):
+        wire.decode(b'{"unit":"t7","boot":1,"seq":2,"t":%s}' % number.encode(), wire.Ack)
+
+
 def test_a_huge_payload_is_refused_unread() -> None:
     with pytest.raises(wire.WireError, match="bytes, at most"):
         wire.decode(b" " * (wire.PAYLOAD_BYTES + 1), wire.Ack)
