@@ -96,12 +96,13 @@ class Supervisor:
     broadcast: send the alarm messages on the bus. start_ns: when the time line begins, None: at the first input.
     monitor_ns: period of the monitoring messages, None for none. utc_offset_ns: UTC minus time line, None where no wall
     clock is known; it may be set at any time, as may utc_trusted. restored: the state stored at the end of an earlier boot.
+    readings: UCS messages whose values are given to `publish`.
     """
 
     def __init__(self, catalog: Catalog, *, unit: str, boot: int = 1, seq: int = 0, armed: Collection[str] | None = None,
                  broadcast: bool = True, start_ns: int | None = None, monitor_ns: int | None = None,
                  utc_offset_ns: int | None = None, utc_trusted: bool = False, restored: State | None = None,
-                 j1939: Mapping[int, int] | None = None):
+                 j1939: Mapping[int, int] | None = None, readings: Collection[str] = ()):
         self.catalog = catalog
         self.unit = unit
         self.boot = boot
@@ -132,7 +133,7 @@ class Supervisor:
         self._compile()
         self._broadcasts = self._make_broadcasts() if broadcast else {}
         self._samplers = self._make_samplers(monitor_ns) if monitor_ns else []
-        self.gate = Gate(catalog, self._sendable())
+        self.gate = Gate(catalog, self._sendable(), frozenset(readings))
         self._heard_ns = self.now_ns
         self._own_keys = frozenset(
             frame_key(message.can_id, message.extended, bus) for name in self._broadcasts
@@ -198,6 +199,24 @@ class Supervisor:
         reason = self._obey(order)
         self.board.settle(self.now_ns)
         self._out.append(Result(order.id, "refused" if reason else "done", reason))
+        return self._take()
+
+    def publish(self, t_ns: int, name: str, raws: Mapping[str, int], broadcast: bool = True) -> Sequence[Output]:
+        """What the UCS says of itself (its computer, its GNSS receiver): on the board as if received, and on the message's buses.
+
+        name: one of `readings`. Raises KeyError, ValueError as `decode.encode`.
+        """
+        self._advance(max(t_ns, self.now_ns))
+        payload = encode(self.catalog.messages[name], raws)
+        try:
+            if not broadcast:
+                raise Refused(f"{name} is not to be sent")
+            self.send(self.now_ns, name, payload, "reading")
+        except Refused:
+            self.counters["readings not sent"] += broadcast
+            if name in self.board.pages:
+                self.board.pages[name].receive(self.now_ns, payload)
+        self.board.settle(self.now_ns)
         return self._take()
 
     def next_deadline(self) -> int | None:
