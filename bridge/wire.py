@@ -17,7 +17,12 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 import msgspec
 from msgspec import Meta
 
-from level1.event import SCHEMA, Event, Monitor, SentFrame
+from level1.event import SCHEMA, SentFrame
+from level1.event import Event as Event
+from level1.event import Monitor as Monitor
+from level1.event import decode as _decode_event
+from level1.event import encode as _encode_event
+from level1.event import seconds as seconds
 
 PREFIX = ("ucs", "v1")
 PAYLOAD_BYTES = 65_536
@@ -229,6 +234,16 @@ def alarm_message(event: Event, prev: int, historical: bool) -> Alarm:
 def event_of(message: Alarm) -> Event:
     """The event a message carries."""
     return Event(**{name: getattr(message, name) for name in Event.__struct_fields__})
+
+
+def event_line(message: Alarm) -> bytes:
+    """The event a message carries as one JSON object (DESIGN §8), to be read by `read_event_line`."""
+    return _encode_event(event_of(message))
+
+
+def read_event_line(line: bytes) -> Event:
+    """The event of a line. Raises msgspec.DecodeError."""
+    return _decode_event(line)
 
 
 def monitor_message(sample: Monitor, seq: int) -> MonitorMessage:

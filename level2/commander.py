@@ -16,10 +16,9 @@ import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from bridge import wire
+from bridge.error import OutsideError
 from bridge.mqtt import Address, MqttConnection, Tls
 from bridge.signing import signed
-from level1.event import seconds
-from level1.io.error import OutsideError
 
 HEAR_NS = 2_000_000_000
 """How long to listen for the unit's clock before a first attempt without it."""
@@ -90,10 +89,10 @@ class Commander:
         return result
 
     def _send(self, clock: _UnitClock) -> wire.Result:
-        now = clock.t + seconds(time.monotonic_ns() - clock.heard_ns)
+        now = clock.t + wire.seconds(time.monotonic_ns() - clock.heard_ns)
         wish = self._wish
-        order = wire.Order(unit=wish.unit, boot=clock.boot, seq=self._signer.counter(), t=now, expires_t=now + seconds(VALID_NS),
-                           id=secrets.token_hex(8), name=wish.name, target=wish.target, value=wish.value)
+        order = wire.Order(unit=wish.unit, boot=clock.boot, seq=self._signer.counter(), t=now, id=secrets.token_hex(8),
+                           expires_t=now + wire.seconds(VALID_NS), name=wish.name, target=wish.target, value=wish.value)
         payload = wire.encode(signed(order, self._fleet, self._signer.key, self._signer.private))
         self._results.clear()
         end_ns = time.monotonic_ns() + PATIENCE_NS

@@ -16,9 +16,9 @@ import msgspec
 
 from bridge import wire
 from bridge.clock import Clock
+from bridge.error import OutsideError
 from bridge.mqtt import Address, MqttConnection, MqttError, Received, Tls, Waker
 from bridge.ranges import Range
-from level1.io.error import OutsideError
 from level2.store import Arrival, Outcome, Sender, Store, StoreError
 
 SILENT_NS = 1_500_000_000

@@ -7,10 +7,9 @@ from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
 
+from bridge.error import OutsideError
 from bridge.ranges import Range, Ranges
-from bridge.wire import Alarm, event_of
-from level1.event import Event, decode, encode
-from level1.io.error import OutsideError
+from bridge.wire import Alarm, Event, event_line, read_event_line
 
 SCHEMA = 1
 
@@ -107,7 +106,7 @@ class Store:
         where, values = ("WHERE unit = ?", [unit]) if unit is not None else ("", [])
         query = f"SELECT line FROM event {where} ORDER BY fleet, unit, boot, seq LIMIT {int(limit)}"
         rows = self._connection.execute(query, values)
-        return [decode(line) for line, in rows]
+        return [read_event_line(line) for line, in rows]
 
     def count(self, table: str) -> int:
         """Rows of one of the tables event, lost, conflict."""
@@ -117,7 +116,7 @@ class Store:
 
     def _add(self, fleet: str, alarm: Alarm, received: str) -> Arrival:
         sender = Sender(fleet, alarm.unit, alarm.boot)
-        line = encode(event_of(alarm))
+        line = event_line(alarm)
         key = (*sender, alarm.seq)
         inserted = self._connection.execute("INSERT OR IGNORE INTO event VALUES (?, ?, ?, ?, ?, ?, ?)",
                                             (*key, line, alarm.historical, received)).rowcount

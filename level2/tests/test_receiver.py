@@ -10,9 +10,9 @@ import pytest
 
 from bridge import wire
 from bridge.broker import EmbeddedBroker
+from bridge.error import OutsideError
 from bridge.mqtt import MqttConnection
-from level1.event import Event, Monitor, seconds
-from level1.io.error import OutsideError
+from bridge.wire import Event, Monitor, seconds
 from level2.receiver import Receiver, ReceiverThread, Settings, event_line
 from level2.store import Arrival, Outcome, Store
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from bridge import wire
-from bridge.wire import Alarm, alarm_message
-from level1.event import Event, seconds
+from bridge.wire import Alarm, Event, alarm_message, seconds
 from level2.store import Arrival, Outcome, Sender, Store, StoreError
 
 SENDER = Sender("farm", "tractor-7", 1)
