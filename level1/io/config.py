@@ -21,6 +21,8 @@ from level1.io.error import OutsideError, did_you_mean
 
 UNITS_NS = {"us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "min": 60_000_000_000, "h": 3_600_000_000_000}
 SCHEMES = ("mqtt", "mqtts")
+FASTEST_HEALTH_NS, SLOWEST_HEALTH_NS = 100_000_000, 1_000_000_000
+"""UCS_HEALTH promises to come once a second (`ucs.dbc`)."""
 SHORTEST_PERIOD_NS, LONGEST_PERIOD_NS = 10_000_000, 60_000_000_000
 _DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)")
 _TOPIC_LEVEL = re.compile(r"[^\s/+#$\x00-\x1f\x7f][^\s/+#\x00-\x1f\x7f]{0,63}")
@@ -57,10 +59,26 @@ class Bus(msgspec.Struct, frozen=True):
 
 
 class Gnss(msgspec.Struct, frozen=True):
-    """A GNSS receiver on a serial line; baud in bit/s (NMEA 0183's own rate is 4800)."""
+    """A GNSS receiver. port: of a serial line, best by its id (`/dev/serial/by-id/…`: others change at replugging), or an address
+    on Ethernet, `socket://host:port`. baud in bit/s (NMEA 0183's own rate is 4800). broadcast: send what it says on the buses."""
 
     port: str
     baud: int = 115200
+    broadcast: bool = False
+
+
+class Recording(msgspec.Struct, frozen=True):
+    """The traffic recorder: folder of its files, and the megabytes they may take together."""
+
+    path: str
+    max_mb: int = 1000
+
+
+class Health(msgspec.Struct, frozen=True):
+    """The state of the computer: how often it is measured; broadcast: send it on the buses."""
+
+    period_ns: int = 1_000_000_000
+    broadcast: bool = True
 
 
 class Repairs(msgspec.Struct, frozen=True):
@@ -98,6 +116,8 @@ class Config(msgspec.Struct, frozen=True):
     journal: JournalFile | None = None
     bridge: BridgeSettings | None = None
     gnss: Gnss | None = None
+    recorder: Recording | None = None
+    health: Health = Health()
     path: str = ""
 
     @property
@@ -228,7 +248,7 @@ def _duration_problems(value: Any, path: str) -> Iterator[str]:
 
 def _rule_problems(table: Mapping[str, Any]) -> Iterator[str]:
     """What types can't say. Looks only at values of the right type: the others are told already."""
-    unit, bridge, gnss = (_sub(table, name) for name in ("unit", "bridge", "gnss"))
+    unit, bridge, gnss, recorder, health = (_sub(table, name) for name in ("unit", "bridge", "gnss", "recorder", "health"))
     for key in ("name", "fleet"):
         name = unit.get(key)
         if isinstance(name, str) and not _TOPIC_LEVEL.fullmatch(name):
@@ -245,6 +265,13 @@ def _rule_problems(table: Mapping[str, Any]) -> Iterator[str]:
     baud = gnss.get("baud")
     if isinstance(baud, int) and not 1200 <= baud <= 4_000_000:
         yield f"gnss.baud: {baud} is outside 1200 to 4000000 bit/s"
+    max_mb = recorder.get("max_mb")
+    if isinstance(max_mb, int) and not 2 <= max_mb <= 10_000_000:
+        yield f"recorder.max_mb: {max_mb} is outside 2 to 10000000 megabytes"
+    period = health.get("period")
+    if (isinstance(period, str) and not list(_duration_problems(period, ""))
+            and not FASTEST_HEALTH_NS <= duration_ns(period) <= SLOWEST_HEALTH_NS):
+        yield f'health.period: "{period}" is outside 100 ms to 1 s'
 
 
 def _bus_problems(buses: Any) -> Iterator[str]:
@@ -310,11 +337,12 @@ def _resolved(config: Config, path: str) -> Config:
 
     buses = tuple(msgspec.structs.replace(bus, dbc=tuple(map(definitions, bus.dbc))) for bus in config.bus)
     journal = config.journal and JournalFile(beside(config.journal.path))
+    recorder = config.recorder and msgspec.structs.replace(config.recorder, path=beside(config.recorder.path))
     bridge = config.bridge
     if bridge:
         files = {key: beside(name) for key in ("ca", "certificate", "key", "keys") if (name := getattr(bridge, key))}
         bridge = msgspec.structs.replace(bridge, **files)
-    return msgspec.structs.replace(config, bus=buses, journal=journal, bridge=bridge, path=path)
+    return msgspec.structs.replace(config, bus=buses, journal=journal, bridge=bridge, recorder=recorder, path=path)
 
 
 def _sub(table: Mapping[str, Any], key: str) -> Mapping[str, Any]:

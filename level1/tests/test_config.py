@@ -57,6 +57,24 @@ def test_the_example_of_the_design_loads(tmp_path: Path) -> None:
     assert loaded.gnss == config.Gnss("/dev/ttyUSB0", 115200)
 
 
+def test_recorder_and_health_have_a_bound_and_a_period(tmp_path: Path) -> None:
+    loaded = load(tmp_path, GOOD + '[recorder]\npath = "traffic"\nmax_mb = 200\n[health]\nperiod = "500 ms"\nbroadcast = false\n')
+    assert loaded.recorder == config.Recording(str(tmp_path / "traffic"), 200)
+    assert loaded.health == config.Health(500_000_000, False)
+    assert load(tmp_path, GOOD).recorder is None and load(tmp_path, GOOD).health == config.Health(1_000_000_000, True)
+
+
+@pytest.mark.parametrize(("more", "problem"), [
+    ('[recorder]\npath = "traffic"\nmax_mb = 1\n', "recorder.max_mb: 1 is outside 2 to 10000000 megabytes"),
+    ("[recorder]\nmax_mb = 10\n", "recorder.path: missing"),
+    ('[health]\nperiod = "2 s"\n', 'health.period: "2 s" is outside 100 ms to 1 s'),
+    ('[health]\nperiod = "50 ms"\n', 'health.period: "50 ms" is outside 100 ms to 1 s'),
+    ('[health]\nbroadcast = "yes"\n', "health.broadcast: expected true or false, found a text ('yes')"),
+])
+def test_mistakes_about_recorder_and_health(tmp_path: Path, more: str, problem: str) -> None:
+    assert problems(tmp_path, GOOD + more) == [problem]
+
+
 def test_the_smallest_configuration_arms_nothing(tmp_path: Path) -> None:
     loaded = load(tmp_path, '[unit]\nname = "a"\n[[bus]]\nname = "b"\nchannel = "can0"\ndbc = ["ucs.dbc"]\n')
     assert loaded.repairs.armed == () and loaded.journal is None and loaded.bridge is None
