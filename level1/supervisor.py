@@ -18,6 +18,7 @@ import msgspec
 
 from level1.alarm import AlarmMachine
 from level1.board import ALWAYS, Board, Cell, Page, Watch
+from level1.canopen import DEVICE_EMERGENCY, DEVICE_SILENT, NMT, Device, Devices
 from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Alarm, Catalog, Command, Message, Repair
 from level1.command import Order
 from level1.condition import Compiler, Things, Thresholds, Verdict, Zone, walk
@@ -94,6 +95,7 @@ class Supervisor:
     unit: its name. boot, with the seq given to each event, is the event's identity: never give the same boot twice. seq:
     last one used. j1939: bus index -> source address to claim there. armed: alarms whose repairs may act; None arms all.
     broadcast: send the alarm messages on the bus. start_ns: when the time line begins, None: at the first input.
+    devices: CANopen devices known beforehand; others are learned when they are heard.
     monitor_ns: period of the monitoring messages, None for none. utc_offset_ns: UTC minus time line, None where no wall
     clock is known; it may be set at any time, as may utc_trusted. restored: the state stored at the end of an earlier boot.
     readings: UCS messages whose values are given to `publish`.
@@ -102,7 +104,8 @@ class Supervisor:
     def __init__(self, catalog: Catalog, *, unit: str, boot: int = 1, seq: int = 0, armed: Collection[str] | None = None,
                  broadcast: bool = True, start_ns: int | None = None, monitor_ns: int | None = None,
                  utc_offset_ns: int | None = None, utc_trusted: bool = False, restored: State | None = None,
-                 j1939: Mapping[int, int] | None = None, readings: Collection[str] = ()):
+                 j1939: Mapping[int, int] | None = None, devices: Iterable[Device] = (),
+                 readings: Collection[str] = ()):
         self.catalog = catalog
         self.unit = unit
         self.boot = boot
@@ -130,6 +133,8 @@ class Supervisor:
         self._watches: list[Watch] = []
         self._repairs: dict[str, RepairMachine] = {}
         self._nodes = {bus: self._node(bus, address) for bus, address in (j1939 or {}).items()}
+        self._devices = Devices(catalog, devices, self, self.timers, self.counters) \
+            if DEVICE_EMERGENCY in self._alarms or DEVICE_SILENT in self._alarms else None
         self._compile()
         self._broadcasts = self._make_broadcasts() if broadcast else {}
         self._samplers = self._make_samplers(monitor_ns) if monitor_ns else []
@@ -263,6 +268,10 @@ class Supervisor:
         if machine.state == NORMAL and not present:
             machines.pop(key, None)
 
+    def causes(self, alarm: str) -> dict[str, dict[str, Any]]:
+        """The causes of an alarm that are reported as being there, by key, with their details."""
+        return {key: machine.detail for key, machine in self._reported.get(alarm, {}).items()}
+
     def _instance(self, alarm: str, key: str, detail: dict[str, Any], text: str) -> AlarmMachine:
         machine = AlarmMachine(self.catalog.alarms[alarm], self, self.timers)
         machine.key, machine.detail, machine.text = key, detail, text
@@ -315,6 +324,8 @@ class Supervisor:
         self.board.settle(start)
         for node in self._nodes.values():
             node.start(start)
+        if self._devices is not None:
+            self._devices.start(start)
         cyclic: list[Timed] = [*self._broadcasts.values(), *self._samplers]
         for timed in cyclic:
             self.timers.set(timed, start)
@@ -350,6 +361,9 @@ class Supervisor:
             self._counts.append(_Window(self, name, window_ns, cell))
         if TROUBLE_CODE in self._alarms or things.codes or self._nodes:
             self._listen(Transport(board.deliver, self.counters))
+        if self._devices is not None:
+            for can_id, listener in self._devices.listeners().items():
+                board.listen_to(can_id, listener)
         board.compile()
 
     def _listen(self, transport: Transport) -> None:
@@ -629,6 +643,8 @@ class Supervisor:
         for bus in self.catalog.buses.get(name, (0,)):
             key = frame_key(message.can_id, message.extended, bus)
             self._out.append(Send(t_ns, key, payload, name, reason, expires_ns))
+            if self._devices is not None and message.can_id == NMT and not message.extended:
+                self._devices.command(t_ns, key, payload)
         page = self.board.pages.get(name)
         if page is not None:
             page.receive(t_ns, payload)

@@ -1,0 +1,360 @@
+"""CANopen devices as level 1 sees them (CiA 301): heartbeat, boot-up, NMT commands, emergencies, error history.
+
+Pure and passive: it listens, commands nobody and asks nobody; time comes with frames and deadlines. What it finds becomes causes
+of two alarms of `ucs.dbc`: each emergency one of `DeviceEmergency`, each lost heartbeat one of `DeviceSilent`.
+
+Theory of operation. A device is known from the configuration, or from its first boot-up or heartbeat: an implement may be coupled
+while the program runs. From then on its heartbeat must come:
+
+    unknown ──boot-up, heartbeat──▶ heard ──nothing for `MARGIN` heartbeat times──▶ silent ──boot-up, heartbeat──▶ heard
+
+- The heartbeat time is the configured one, else that of the EDS, else learned: the longest gap between the first heartbeats.
+- After a command to reset, the device has `BOOT_NS` to come back. A device that sends no heartbeat is not missed.
+- An emergency stays until the device says that it is over (error code 0x00xx) or has booted: both forget all its errors. When the
+  error register that comes with 0x00xx still has bits set, only the errors are over whose own bit is not among them.
+- Answers to others who read the error history (object 0x1003 by SDO) are taken along with the emergencies.
+
+The identifiers of heartbeats and emergencies mean that only on a CANopen bus. A bus is one when it has a configured device, or
+when a well-formed heartbeat was heard on it; an identifier that a DBC file gives to another message is never taken for one.
+"""
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Protocol
+
+import msgspec
+
+from level1.catalog import Catalog, Message
+from level1.frame import BUS_SHIFT
+from level1.timer import FAR, Timers
+
+DEVICE_EMERGENCY, DEVICE_SILENT = "DeviceEmergency", "DeviceSilent"
+NMT, EMERGENCY, SDO_ANSWER, HEARTBEAT = 0x000, 0x080, 0x580, 0x700
+"""Identifiers of the predefined connection set; all but NMT's plus the node id."""
+NODES = range(1, 128)
+MARGIN = 3
+"""Heartbeat times without a heartbeat that make a device silent: two frames may be lost. As for messages (`STALE_CYCLES`)."""
+SHORTEST_NS = 300_000_000
+"""Silence that is never told: heartbeats of 100 ms and less may come as late as that."""
+LONGEST_LEARNED_NS = 65_535_000_000
+"""Longest heartbeat time that object 0x1017 can hold."""
+LEARN = 3
+"""Heartbeats from which an unknown heartbeat time is learned."""
+BOOT_NS = 5_000_000_000
+"""Time for a device to come back after it was reset."""
+MAX_ERRORS = 16
+"""Emergencies of one device at a time; more are counted, not kept: a babbling device must not crowd the others out."""
+MAX_HISTORY = 8
+"""Entries of the error history that events carry."""
+HISTORY = 0x1003
+
+STATES = {0: "booting", 4: "stopped", 5: "operational", 127: "pre-operational"}
+"""NMT states, as heartbeats say them."""
+START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
+REGISTER = ("generic", "current", "voltage", "temperature", "communication", "device profile", "reserved", "manufacturer")
+"""Bits of the error register, object 0x1001."""
+
+ERRORS: Mapping[int, str] = {
+    0x1000: "an error it does not name", 0x2000: "current", 0x2100: "current on the input side", 0x2200: "current inside",
+    0x2300: "current on the output side", 0x3000: "voltage", 0x3100: "supply voltage", 0x3200: "voltage inside",
+    0x3300: "output voltage", 0x4000: "temperature", 0x4100: "ambient temperature", 0x4200: "temperature of the device",
+    0x5000: "its hardware", 0x6000: "its software", 0x6100: "its internal software", 0x6200: "its user software",
+    0x6300: "its data set", 0x7000: "an additional module", 0x8000: "monitoring", 0x8100: "communication",
+    0x8110: "frames lost by overrun", 0x8120: "CAN error passive", 0x8130: "a heartbeat or life guard it waits for is missing",
+    0x8140: "back from bus-off", 0x8150: "another device uses its identifier", 0x8200: "protocol",
+    0x8210: "a PDO too short to be used", 0x8220: "a PDO longer than defined", 0x8230: "a multiplexed PDO without destination",
+    0x8240: "a SYNC of wrong length", 0x8250: "a PDO it waits for is missing", 0x9000: "an error outside of it",
+    0xF000: "an additional function", 0xFF00: "an error of its own kind",
+}
+"""What an error code is about (CiA 301, table of emergency error codes, in other words). A code stands for its group: 0x31xx."""
+_REGISTER_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x8: 0x10}
+"""Bits of the error register that belong to an error code, by its first digit."""
+
+Listener = Callable[[int, int, bytes], None]
+
+
+class Device(msgspec.Struct, frozen=True):
+    """A device known from the configuration.
+
+    bus: its index. node: 1 to 127. heartbeat_ns: its heartbeat time, None: learned; 0: it has none and is not missed.
+    required: it is missed also when it was never heard; else only from its first sign of life on. errors: texts by error code.
+    """
+
+    bus: int
+    node: int
+    name: str = ""
+    heartbeat_ns: int | None = None
+    required: bool = False
+    errors: dict[int, str] = {}
+
+
+class Host(Protocol):
+    """What this asks of the supervisor."""
+
+    def report(self, t_ns: int, alarm: str, key: str, present: bool, detail: dict[str, Any], text: str) -> None:
+        """One cause of an alarm is there, or no more."""
+
+    def causes(self, alarm: str) -> Mapping[str, dict[str, Any]]:
+        """The causes of an alarm that are there, by key, with their details."""
+
+
+class Emergency(msgspec.Struct, frozen=True):
+    """An emergency message. code: error code; register: error register; maker: the five bytes that its maker defines."""
+
+    code: int
+    register: int
+    maker: bytes
+
+    @property
+    def is_reset(self) -> bool:
+        """Whether it says that an error is over."""
+        return self.code < 0x100
+
+    @property
+    def flags(self) -> str:
+        """The bits of the error register in words."""
+        return ", ".join(word for place, word in enumerate(REGISTER) if self.register >> place & 1)
+
+
+def parse_emergency(data: bytes) -> Emergency | None:
+    """Read an emergency message (CiA 301 §7.2.7); None unless it has eight bytes."""
+    if len(data) != 8:
+        return None
+    return Emergency(data[0] | data[1] << 8, data[2], bytes(data[3:]))
+
+
+def describe(code: int, own: Mapping[int, str] = {}) -> str:
+    """An error code in words: those of the device (`own`), else those of the standard, from the whole code to its first digit."""
+    for table in (own, ERRORS):
+        for known in (code, code & 0xFF00, code & 0xF000):
+            if known in table:
+                return table[known]
+    return "an unknown error"
+
+
+def outlives(code: int, register: int) -> bool:
+    """Whether an error may still be there when 0x00xx came with this error register."""
+    if code & 0xFF00 == 0xFF00:
+        return bool(register & 0xA0)
+    bit = _REGISTER_BITS.get(code >> 12)
+    return bool(register & bit) if bit is not None else register != 0
+
+
+class _Node:
+    """A device that was heard or is waited for. heartbeat_ns: None while unknown; gaps: what it is learned from."""
+
+    __slots__ = ("_devices", "boots_ns", "bus", "due", "gaps", "heard", "heartbeat_ns", "history", "last_ns", "node", "order",
+                 "ordered", "silent", "state")
+
+    def __init__(self, devices: Devices, bus: int, node: int, heartbeat_ns: int | None):
+        self._devices = devices
+        self.bus, self.node = bus, node
+        self.heartbeat_ns = heartbeat_ns
+        self.gaps: list[int] = []
+        self.order = devices.timers.order()
+        self.due = FAR
+        self.state: int | None = None
+        self.heard = self.silent = self.ordered = False
+        self.last_ns = 0
+        self.boots_ns = 0
+        self.history: dict[int, int] = {}
+
+    @property
+    def deadline_ns(self) -> int | None:
+        """When it counts as silent if nothing comes; None: never."""
+        if not self.heartbeat_ns:
+            return None
+        return max(self.last_ns + max(MARGIN * self.heartbeat_ns, SHORTEST_NS), self.boots_ns)
+
+    def sign(self, t_ns: int, state: int) -> None:
+        """A boot-up or heartbeat."""
+        if state and self.state and not self.silent:
+            self._learn(t_ns - self.last_ns)
+        self.heard = True
+        self.silent = False
+        self.state = state
+        self.last_ns = t_ns
+        self.boots_ns = 0
+        self.wait()
+
+    def wait(self) -> None:
+        """See to it that silence will be noticed. A deadline that is set already looks anew when it comes."""
+        deadline = self.deadline_ns
+        if deadline is not None and self.due > deadline:
+            self._devices.timers.set(self, deadline)
+
+    def _learn(self, gap_ns: int) -> None:
+        if self.heartbeat_ns is None and 0 < gap_ns <= LONGEST_LEARNED_NS:
+            self.gaps.append(gap_ns)
+            if len(self.gaps) >= LEARN - 1:
+                self.heartbeat_ns = max(self.gaps)
+
+    def expire(self, now_ns: int) -> None:
+        """It may have fallen silent."""
+        deadline = self.deadline_ns
+        if deadline is None or self.silent:
+            return
+        if deadline > now_ns:
+            self._devices.timers.set(self, deadline)
+        else:
+            self.silent = True
+            self._devices.lost(now_ns, self)
+
+
+class Devices:
+    """The CANopen devices of all buses.
+
+    catalog: what DBC files define, so that its identifiers are not mistaken. devices: those known from the configuration.
+    counters: takes what is worth counting, but no alarm.
+    """
+
+    def __init__(self, catalog: Catalog, devices: Iterable[Device], host: Host, timers: Timers, counters: Counter[str]):
+        self.timers = timers
+        self._host = host
+        self._counters = counters
+        self._known = {(device.bus, device.node): device for device in devices}
+        self._buses = {bus for bus, _ in self._known}
+        self._defined: dict[tuple[int, int], Message] = {
+            (bus, message.can_id): message for name, message in catalog.messages.items() if not message.extended
+            for bus in catalog.buses.get(name, (0,))}
+        self._nodes: dict[tuple[int, int], _Node] = {}
+
+    def listeners(self) -> dict[int, Listener]:
+        """Who wants to hear which 11-bit identifier."""
+        wanted: dict[int, Listener] = {NMT: self.command}
+        for node in NODES:
+            wanted |= {EMERGENCY + node: self.emergency, SDO_ANSWER + node: self.answer, HEARTBEAT + node: self.heartbeat}
+        return wanted
+
+    def start(self, t_ns: int) -> None:
+        """The time line begins: from now on devices that must be there are waited for."""
+        for (bus, number), device in self._known.items():
+            if device.required and device.heartbeat_ns:
+                node = self._node(bus, number)
+                node.last_ns = t_ns
+                node.boots_ns = t_ns + BOOT_NS
+                node.wait()
+
+    def name(self, bus: int, node: int) -> str:
+        """How to call a device in a text."""
+        device = self._known.get((bus, node))
+        return f"{device.name} (node {node})" if device is not None and device.name else f"node {node}"
+
+    # --- what is heard ----------------------------------------------------------------------------------------------------
+
+    def heartbeat(self, t_ns: int, key: int, data: bytes) -> None:
+        """A heartbeat, a boot-up, or the answer of a guarded node, whose highest bit alternates."""
+        bus, number = key >> BUS_SHIFT, key & 0x7F
+        defined = self._defined.get((bus, key & 0x7FF))
+        if len(data) != 1 or data[0] & 0x7F not in STATES or defined is not None and defined.length != 1:
+            if (bus, number) in self._nodes:
+                self._counters["CANopen: malformed heartbeats"] += 1
+            return
+        self._buses.add(bus)
+        node = self._node(bus, number)
+        booted = data[0] == 0
+        if booted:
+            self._booted(t_ns, node)
+        known = node.heard and not node.silent
+        node.sign(t_ns, data[0] & 0x7F)
+        if not known:
+            self._host.report(t_ns, DEVICE_SILENT, f"{bus}/{number}", False, {}, "")
+
+    def _booted(self, t_ns: int, node: _Node) -> None:
+        if node.heard and not node.ordered and not node.silent:
+            self._counters["CANopen: devices that booted by themselves"] += 1
+        node.ordered = False
+        node.history.clear()
+        self._forget(t_ns, node.bus, node.node, 0)
+
+    def command(self, t_ns: int, key: int, data: bytes) -> None:
+        """An NMT command, of whomever, the UCS included: to one device, or to all (node 0)."""
+        bus = key >> BUS_SHIFT
+        if len(data) != 2 or data[0] not in (RESET_NODE, RESET_COMMUNICATION) or bus not in self._buses:
+            return
+        for (its_bus, number), node in self._nodes.items():
+            if its_bus == bus and data[1] in (0, number):
+                node.ordered = True
+                node.boots_ns = t_ns + BOOT_NS
+
+    def emergency(self, t_ns: int, key: int, data: bytes) -> None:
+        """An emergency message."""
+        bus, number = key >> BUS_SHIFT, key & 0x7F
+        known = (bus, number) in self._known or (bus, number) in self._nodes
+        if bus not in self._buses or not known and (bus, key & 0x7FF) in self._defined:
+            return
+        emergency = parse_emergency(data)
+        if emergency is None:
+            self._counters["CANopen: malformed emergencies"] += 1
+        elif emergency.is_reset:
+            self._forget(t_ns, bus, number, emergency.register)
+        else:
+            self._tell(t_ns, bus, number, emergency)
+
+    def answer(self, t_ns: int, key: int, data: bytes) -> None:
+        """An answer of a device to someone who reads it; of use when it is an entry of the error history (expedited upload)."""
+        bus, number = key >> BUS_SHIFT, key & 0x7F
+        if (bus, number) not in self._nodes or len(data) != 8 or data[0] & 0xE2 != 0x42 or data[1] | data[2] << 8 != HISTORY:
+            return
+        node, place = self._nodes[bus, number], data[3]
+        if place == 0:
+            node.history = {old: code for old, code in node.history.items() if old <= data[4]}
+        elif place <= MAX_HISTORY:
+            node.history[place] = data[4] | data[5] << 8
+            for error, detail in self._errors(bus, number).items():
+                self._host.report(t_ns, DEVICE_EMERGENCY, error, True, detail | _history(node), "")
+
+    # --- what comes of it -------------------------------------------------------------------------------------------------
+
+    def lost(self, t_ns: int, node: _Node) -> None:
+        """A device has fallen silent."""
+        last = STATES[node.state] if node.state is not None else "never heard"
+        quiet_s = (t_ns - node.last_ns) / 1e9
+        detail = self._who(node.bus, node.node) | {"LastState": last, "Silent": f"{quiet_s:.3f} s"}
+        why = f"has not come back {quiet_s:g} s after it was reset" if node.ordered else \
+            f"no heartbeat for {quiet_s:g} s" if node.heard else f"was not heard within {quiet_s:g} s of the start"
+        node.ordered = False
+        self._host.report(t_ns, DEVICE_SILENT, f"{node.bus}/{node.node}", True, detail, f"{self.name(node.bus, node.node)}: {why}")
+
+    def _tell(self, t_ns: int, bus: int, number: int, emergency: Emergency) -> None:
+        """An emergency. Two with the same code and maker's bytes are one error: the register tells of all errors of the device."""
+        key = f"{bus}/{number}/{emergency.code:04X}/{emergency.maker.hex().upper()}"
+        others = self._errors(bus, number)
+        if key not in others and len(others) >= MAX_ERRORS:
+            self._counters["CANopen: emergencies of one device beyond the limit"] += 1
+            return
+        device = self._known.get((bus, number))
+        words = describe(emergency.code, device.errors if device is not None else {})
+        detail = self._who(bus, number) | {"ErrorCode": f"0x{emergency.code:04X}", "Error": words, "ErrorRegister": emergency.flags,
+                                           "MakerBytes": emergency.maker.hex().upper()}
+        node = self._nodes.get((bus, number))
+        text = f"{self.name(bus, number)}: {words} (0x{emergency.code:04X})"
+        self._host.report(t_ns, DEVICE_EMERGENCY, key, True, detail | (_history(node) if node is not None else {}), text)
+
+    def _forget(self, t_ns: int, bus: int, number: int, register: int) -> None:
+        for key in self._errors(bus, number):
+            if not outlives(int(key.split("/")[2], 16), register):
+                self._host.report(t_ns, DEVICE_EMERGENCY, key, False, {}, "")
+
+    def _errors(self, bus: int, number: int) -> dict[str, dict[str, Any]]:
+        """The errors of a device, those from before a restart of the program too."""
+        start = f"{bus}/{number}/"
+        return {key: detail for key, detail in self._host.causes(DEVICE_EMERGENCY).items() if key.startswith(start)}
+
+    def _who(self, bus: int, number: int) -> dict[str, Any]:
+        device = self._known.get((bus, number))
+        return {"Bus": bus, "Node": number, "Device": device.name if device is not None else ""}
+
+    def _node(self, bus: int, number: int) -> _Node:
+        node = self._nodes.get((bus, number))
+        if node is None:
+            device = self._known.get((bus, number))
+            node = self._nodes[bus, number] = _Node(self, bus, number, device.heartbeat_ns if device is not None else None)
+        return node
+
+
+def _history(node: _Node) -> dict[str, Any]:
+    """The last errors, the newest first, as far as they were heard."""
+    codes = [f"0x{code:04X}" for _, code in sorted(node.history.items())]
+    return {"ErrorHistory": " ".join(codes)} if codes else {}
