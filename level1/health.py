@@ -104,9 +104,8 @@ def _reserved(signal: Signal) -> tuple[int, int]:
     return (ranges[0][1], ranges[-1][1]) if ranges else (top, top)
 
 
-def health(host: Host, loop: Loop, navigation: Navigation, gnss_time: bool) -> dict[str, Value]:
-    """Signals of UCS_HEALTH. gnss_time: whether UTC comes from the receiver."""
-    fix = navigation.fix
+def health(host: Host, loop: Loop, fix: int | None, gnss_time: bool) -> dict[str, Value]:
+    """Signals of UCS_HEALTH. fix: index into `FIXES`; gnss_time: whether UTC comes from the receiver."""
     quality = None if fix is None else FIXES[fix] if fix in MEASURED else FIXES[0]
     return {
         "CpuTemperature": host.cpu_celsius, "MainboardTemperature": host.mainboard_celsius, "RamUsed": host.ram_used_percent,

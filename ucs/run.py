@@ -22,6 +22,7 @@ from level1.io.inbox import Inbox
 from level1.io.journal import Journal
 from level1.io.live import Live, decode_state
 from level1.supervisor import State, Supervisor
+from ucs import readings
 from ucs.printer import Printer
 from ucs.render import clock, event_line, painted, wants_colour
 from ucs.uplink import Uplink
@@ -42,6 +43,7 @@ def run(args: Namespace) -> int:
     settings = config.load(args.unit)
     catalog = definitions.load((), settings.bus_files, settings.bus_names)
     config.check_armed(settings, catalog)
+    own = readings.messages(settings, catalog)
     if args.check:
         print(*_start_lines(settings, catalog), f"{settings.path}: good", sep="\n")
         return 0
@@ -56,9 +58,11 @@ def run(args: Namespace) -> int:
             stack.callback(port.stop)
         journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name))
         uplink = stack.enter_context(Uplink(journal, inbox, time.monotonic_ns))
-        live = Live(_supervisor(settings, catalog, journal), journal, ports, inbox, clock=time.monotonic_ns,
-                    wall=time.time_ns, told=_teller(printer), notice=lambda text: printer.err(f"ucs: {text}"), link=uplink)
-        stack.callback(lambda: printer.out("\n".join(_end_lines(live, ports))))
+        sources = readings.start(settings, catalog, ports, journal, inbox, stack)
+        live = Live(_supervisor(settings, catalog, journal, own), journal, ports, inbox, clock=time.monotonic_ns,
+                    wall=time.time_ns, told=_teller(printer), notice=lambda text: printer.err(f"ucs: {text}"), link=uplink,
+                    house=sources.house, gnss=sources.gnss, recorder=sources.recorder, quiet=readings.quiet(settings))
+        stack.callback(lambda: printer.out("\n".join(_end_lines(live, ports, sources))))
         with _ended_by_signals(live):
             printer.out("\n".join(_start_lines(settings, catalog)))
             printer.out(f"boot {journal.boot}, journal {settings.journal.path}; supervising")
@@ -66,11 +70,11 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def _supervisor(settings: Config, catalog: Catalog, journal: Journal) -> Supervisor:
+def _supervisor(settings: Config, catalog: Catalog, journal: Journal, own: frozenset[str]) -> Supervisor:
     """The supervisor of this boot, with the latches and budgets of the last one."""
     return Supervisor(catalog, unit=settings.unit.name, boot=journal.boot, armed=settings.repairs.armed,
                       start_ns=time.monotonic_ns(), j1939=settings.j1939, restored=_restored(journal),
-                      monitor_ns=settings.bridge.period_ns if settings.bridge else None)
+                      monitor_ns=settings.bridge.period_ns if settings.bridge else None, readings=own)
 
 
 def _restored(journal: Journal) -> State | None:
@@ -112,10 +116,12 @@ def _start_lines(settings: Config, catalog: Catalog) -> Iterator[str]:
     passive = [name for name in repairable if name not in settings.repairs.armed]
     yield f"  {len(catalog.alarms)} alarms; repairs armed: {', '.join(armed) or 'none'}; passive: {', '.join(passive) or 'none'}"
     if settings.gnss:
-        yield f"  gnss {settings.gnss.port}: not read by this version"
+        yield f"  gnss {settings.gnss.port}, {settings.gnss.baud} bit/s"
+    if settings.recorder:
+        yield f"  traffic recorded in {settings.recorder.path}, at most {settings.recorder.max_mb} MB"
 
 
-def _end_lines(live: Live, ports: list[Port]) -> Iterator[str]:
+def _end_lines(live: Live, ports: list[Port], sources: readings.Sources) -> Iterator[str]:
     """What became of the frames."""
     yield "stopped"
     for port in ports:
@@ -125,3 +131,8 @@ def _end_lines(live: Live, ports: list[Port]) -> Iterator[str]:
         yield f"  {count} {word}"
     if live.dropped:
         yield f"  {live.dropped} frames dropped"
+    if sources.gnss is not None:
+        counts = ", ".join(f"{count} {word}" for word, count in sorted(sources.gnss.counters.items()))
+        yield f"  gnss: {counts or 'nothing heard'}"
+    if sources.recorder is not None and sources.recorder.dropped:
+        yield f"  {sources.recorder.dropped} frames not recorded"

@@ -20,7 +20,7 @@ import serial
 
 from level1.health import GnssReadings, Reading
 from level1.io.config import Gnss
-from level1.nmea import Navigator
+from level1.nmea import FRESH_NS, Navigator
 
 POLL_S = 0.2
 """How long the thread waits for a byte before it looks whether anything else is due."""
@@ -57,7 +57,6 @@ class GnssReceiver:
     def __init__(self, settings: Gnss, *, clock: Callable[[], int], wall: Callable[[], int], told: Callable[[], None],
                  notice: Callable[[str], None], opener: Callable[[Gnss], Line] | None = None):
         self.settings = settings
-        self.fix: int | None = None
         self._navigator = Navigator()
         self._readings = GnssReadings()
         self._clock, self._wall, self._told, self._notice = clock, wall, told, notice
@@ -67,6 +66,7 @@ class GnssReceiver:
         self._is_missing = False
         self._waiting: deque[Reading] = deque()
         self._offset_ns: int | None = None
+        self._fix: tuple[int, int | None] = (clock(), None)
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"gnss {settings.port}", daemon=True)
@@ -75,6 +75,12 @@ class GnssReceiver:
     def counters(self) -> Counter[str]:
         """What came, what was lost."""
         return self._navigator.counters + self._lost
+
+    @property
+    def fix(self) -> int | None:
+        """Quality of the fix, index into `navigation.FIXES`; None: not known, or not lately."""
+        said_ns, fix = self._fix
+        return fix if self._clock() - said_ns <= FRESH_NS else None
 
     def start(self) -> None:
         """Begin to read; never fails."""
@@ -132,7 +138,7 @@ class GnssReceiver:
         self._offset_ns = self._navigator.utc_offset_ns(now_ns)
         error_ns = None if self._offset_ns is None else self._wall() - now_ns - self._offset_ns
         readings = self._readings.take(now_ns, news, navigation, error_ns)
-        self.fix = navigation.fix
+        self._fix = (now_ns, navigation.fix)
         if not readings:
             return
         with self._lock:

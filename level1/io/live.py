@@ -7,15 +7,18 @@ the wall clock of a tractor jumps.
 """
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Callable, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Collection, Sequence
 from typing import Protocol
 
 import msgspec
 
+from level1 import health
 from level1.event import Event, Monitor, Output, Result, Send
 from level1.frame import BUS_SHIFT, Frame
+from level1.health import Reading
 from level1.io.can import Port
+from level1.io.host import clock_is_synchronised
 from level1.io.inbox import Inbox
 from level1.supervisor import State, Supervisor
 
@@ -23,7 +26,6 @@ LAG_NS = 2_000_000
 """Deadlines are served so late, that a frame stamped before one, which its reader hands over a moment later, still counts."""
 LONGEST_WAIT_S = 1.0
 TRUST_PERIOD_NS = 10_000_000_000
-_TIME_ERROR = 5
 
 
 class EventStore(Protocol):
@@ -48,21 +50,49 @@ class Link(Protocol):
         """Called at every turn: events that were just journaled, monitoring messages and answers to orders."""
 
 
+class Tap(Protocol):
+    """What the loop needs of `level1.io.recorder.Recorder`; never blocks."""
+
+    def record(self, frames: Sequence[Frame] | Sequence[Send]) -> None:
+        """Record what was received or sent."""
+
+
+class Receiver(Protocol):
+    """What the loop needs of `level1.io.gnss.GnssReceiver`."""
+
+    def take(self) -> Sequence[Reading]:
+        """The readings since the last call."""
+
+    def utc_offset_ns(self) -> int | None:
+        """UTC minus the monotonic clock by the satellites, None: not known."""
+
+
+class House(Protocol):
+    """What the loop needs of `level1.io.housekeeping.Housekeeping`."""
+
+    def take(self, lateness_ns: int, dropped: int) -> Sequence[Reading]:
+        """The readings since the last call. lateness_ns: of this turn; dropped: frames lost so far."""
+
+
 class Live:
     """Drives a supervisor from an inbox and ports until `stop`.
 
     supervisor: of this boot, not yet given anything. ports: in the order of the bus indexes, started and stopped by the
     caller. told: called with every event once it is in the journal. notice: called with a line about the world (a bus lost,
     the journal's disk full). clock, wall: monotonic and wall clock in ns. dropped: frames that came faster than they were
-    supervised.
+    supervised. recorder, gnss, house: the traffic recorder, the GNSS receiver, the state of the computer, where there are any.
+    quiet: readings that are not sent on the buses.
     """
 
     def __init__(self, supervisor: Supervisor, journal: EventStore, ports: Sequence[Port], inbox: Inbox, *,
                  clock: Callable[[], int], wall: Callable[[], int], told: Callable[[Event], None],
-                 notice: Callable[[str], None], link: Link | None = None):
+                 notice: Callable[[str], None], link: Link | None = None, recorder: Tap | None = None,
+                 gnss: Receiver | None = None, house: House | None = None, quiet: Collection[str] = ()):
         self.supervisor, self.journal, self.ports, self.inbox = supervisor, journal, ports, inbox
         self.dropped = 0
         self._clock, self._wall, self._told, self._notice, self._link = clock, wall, told, notice, link
+        self._recorder, self._gnss, self._house, self._quiet = recorder, gnss, house, frozenset(quiet)
+        self._synchronised = False
         self._stopping = False
         self._served_ns = clock()
         self._retry_ns: int | None = None
@@ -94,7 +124,8 @@ class Live:
         if load.dropped:
             self.dropped += load.dropped
             self._notice(f"{load.dropped} frames dropped, the oldest first: supervision can't keep up")
-        outputs = self._feed(load.frames)
+        load.frames.sort(key=_stamp)
+        outputs = self._feed(load.frames, self._readings(load.frames, now_ns))
         self._served_ns = max(self._served_ns, now_ns - LAG_NS, self.supervisor.now_ns)
         for order in load.orders:
             outputs.extend(self.supervisor.command(order, self._served_ns))
@@ -103,12 +134,36 @@ class Live:
             outputs.extend(self.supervisor.tick(self._served_ns))
         self._deliver(outputs)
 
-    def _feed(self, frames: list[Frame]) -> list[Output]:
-        """Frames of several buses, in the order of their stamps."""
-        if not frames:
+    def _readings(self, frames: Sequence[Frame], now_ns: int) -> list[Reading]:
+        """What the UCS says of itself since the last turn, in the order of the stamps."""
+        readings = list(self._gnss.take()) if self._gnss is not None else []
+        if self._house is not None:
+            deadline = self.supervisor.next_deadline()
+            oldest_ns = min(frames[0].t_ns if frames else now_ns, now_ns if deadline is None else deadline)
+            readings += self._house.take(max(0, now_ns - oldest_ns), self.dropped)
+        readings.sort(key=_stamp)
+        return readings
+
+    def _feed(self, frames: list[Frame], readings: Sequence[Reading]) -> list[Output]:
+        """Frames of several buses and the readings among them, in the order of their stamps."""
+        if not frames and not readings:
             return []
-        frames.sort(key=_stamp)
-        return self.supervisor.receive_many(frames)
+        if self._recorder is not None:
+            self._recorder.record(frames)
+        outputs: list[Output] = []
+        begin = 0
+        for reading in readings:
+            end = bisect_right(frames, reading.t_ns, begin, key=_stamp)
+            outputs += self.supervisor.receive_many(frames[begin:end])
+            outputs += self._publish(reading)
+            begin = end
+        return outputs + self.supervisor.receive_many(frames[begin:] if begin else frames)
+
+    def _publish(self, reading: Reading) -> Sequence[Output]:
+        if reading.message not in self.supervisor.gate.readings:
+            return ()
+        raws = health.raws(self.supervisor.catalog.messages[reading.message], reading.values)
+        return self.supervisor.publish(reading.t_ns, reading.message, raws, reading.message not in self._quiet)
 
     def _deliver(self, outputs: Sequence[Output]) -> None:
         """Durable first; then to the buses; then upward."""
@@ -117,9 +172,11 @@ class Live:
         if events or any(isinstance(output, Result) for output in upward):
             self.journal.append(events, encode_state(self.supervisor.state()))
         now_ns = self._clock()
-        for output in outputs:
-            if isinstance(output, Send):
-                self.ports[output.key >> BUS_SHIFT].send(output, now_ns)
+        sends = [output for output in outputs if isinstance(output, Send)]
+        for send in sends:
+            self.ports[send.key >> BUS_SHIFT].send(send, now_ns)
+        if sends and self._recorder is not None:
+            self._recorder.record(sends)
         retries = [retry for port in self.ports if (retry := port.flush(now_ns)) is not None]
         self._retry_ns = min(retries, default=None)
         if self._link is not None:
@@ -145,11 +202,14 @@ class Live:
         return min(max(wait_s, 0.0), LONGEST_WAIT_S)
 
     def _label(self, now_ns: int) -> None:
-        """UTC beside the time line, and whether it is to be trusted."""
-        self.supervisor.utc_offset_ns = self._wall() - now_ns
+        """UTC beside the time line, and whether it is to be trusted: the wall clock if something keeps it right, else the
+        satellites, else the wall clock all the same."""
         if now_ns >= self._trust_due_ns:
             self._trust_due_ns = now_ns + TRUST_PERIOD_NS
-            self.supervisor.utc_trusted = clock_is_synchronised()
+            self._synchronised = clock_is_synchronised()
+        offset_ns = None if self._synchronised or self._gnss is None else self._gnss.utc_offset_ns()
+        self.supervisor.utc_offset_ns = self._wall() - now_ns if offset_ns is None else offset_ns
+        self.supervisor.utc_trusted = self._synchronised or offset_ns is not None
 
 
 def encode_state(state: State) -> bytes:
@@ -162,12 +222,5 @@ def decode_state(stored: bytes) -> State:
     return msgspec.json.decode(stored, type=State)
 
 
-def clock_is_synchronised() -> bool:
-    """Whether the kernel says that something (NTP, GNSS) keeps the wall clock right (adjtimex(2))."""
-    buffer = ctypes.create_string_buffer(512)
-    state: int = ctypes.CDLL(None).adjtimex(buffer)
-    return 0 <= state < _TIME_ERROR
-
-
-def _stamp(frame: Frame) -> int:
-    return frame.t_ns
+def _stamp(item: Frame | Reading) -> int:
+    return item.t_ns
