@@ -11,6 +11,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from decimal import Decimal
 from pathlib import Path
 from typing import Literal
 
@@ -35,6 +36,9 @@ ALIVE_NS = 2_000_000_000
 CONNECT_NS = 500_000_000
 """Pause before the next attempt to connect; doubled up to `CONNECT_LONGEST_NS`, give or take half."""
 CONNECT_LONGEST_NS = 30_000_000_000
+MONITOR_PERIOD = "monitor_period"
+"""The one command that is the bridge's own: seconds between monitoring messages."""
+PERIOD_LONGEST_NS = 3_600_000_000_000
 ANSWER_NS = 5_000_000_000
 """Patience with supervision's answer to an order."""
 STRANGERS_NS = 200_000_000
@@ -104,6 +108,7 @@ class Bridge:
         self._online = False
         self._alive_ns: int | None = None
         self._supervising = False
+        self._period_ns = settings.period_ns
         self._samples: dict[str, Monitor] = {}
         self._sample_due_ns: dict[str, int] = {}
         self._sample_seq: Counter[str] = Counter()
@@ -321,9 +326,22 @@ class Bridge:
 
     def _instruct(self, passed: Passed, now_ns: int) -> None:
         self.counters["command passed"] += 1
+        if passed.order.name == MONITOR_PERIOD:
+            outcome, reason = self._set_period(passed.order.value)
+            self._gate.remember(passed, outcome, reason)
+            self._publish_result(passed.id, passed.seq, outcome, reason)
+            return
         self._commands[passed.order.id] = (passed, now_ns + ANSWER_NS)
         if not self._link.instruct(passed.order):
             self._answer(passed.order.id, "refused", "supervision is not running")
+
+    def _set_period(self, period_s: Decimal | None) -> tuple[str, str]:
+        """A longer period of monitoring messages, for a poor link; that of the configuration when no value is given."""
+        period_ns = self.settings.period_ns if period_s is None else int(period_s * 10**9)
+        if not self.settings.period_ns <= period_ns <= PERIOD_LONGEST_NS:
+            return "refused", f"give seconds from {self.settings.period_ns / 1e9:g} to {PERIOD_LONGEST_NS // 10**9}"
+        self._period_ns = period_ns
+        return "done", ""
 
     def _answer(self, id: str, outcome: str, reason: str) -> None:
         """Supervision's answer, or the lack of one, to an order that passed."""
@@ -383,8 +401,7 @@ class Bridge:
     def _publish_samples(self, connection: MqttConnection, now_ns: int) -> None:
         """The latest of each, at its period; on a congested link the next one will be newer."""
         for name in [name for name in self._samples if self._sample_due_ns.get(name, 0) <= now_ns]:
-            period_ns = self.settings.period_ns
-            self._sample_due_ns[name] = max(self._sample_due_ns.get(name, 0), now_ns - period_ns) + period_ns
+            self._sample_due_ns[name] = max(self._sample_due_ns.get(name, 0), now_ns - self._period_ns) + self._period_ns
             if connection.congested:
                 continue
             sample = self._samples.pop(name)

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import signal
+import socket
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,17 +35,44 @@ def add_parser(subparsers: Any) -> None:
     """The arguments of `ucs bridge`."""
     parser = subparsers.add_parser("bridge", help="carry a unit's events to level 2 and commands back", description=DESCRIPTION,
                                    epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("unit", metavar="unit.toml", type=Path, help="the unit's configuration")
+    parser.add_argument("unit", metavar="unit.toml", type=Path, nargs="?", help="the unit's configuration")
+    site = parser.add_argument_group("a test site", "mosquitto's configuration with mutual TLS, and all certificates it takes")
+    site.add_argument("--make-site", metavar="DIR", type=Path, help="write one into this new folder and end")
+    site.add_argument("--fleet", metavar="NAME", default="fleet", help="(%(default)s, or that of unit.toml)")
+    site.add_argument("--name", metavar="UNIT", action="append", default=[], help="a unit of it; may be repeated")
+    site.add_argument("--host", metavar="HOST", action="append", default=[],
+                      help="a name or address of the broker; may be repeated (default: this machine's)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until SIGINT or SIGTERM. Raises OutsideError for what the user can put right."""
+    """Serve until SIGINT or SIGTERM, or make a site. Raises OutsideError for what the user can put right."""
+    if args.make_site:
+        return _make_site(args)
+    if args.unit is None:
+        raise ConfigError("ucs bridge: give the path of a unit.toml")
     from bridge.session import Bridge
     settings = settings_of(load(args.unit))
     bridge = Bridge(settings, lambda line: print(f"ucs bridge: {line}", file=sys.stderr, flush=True))
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: bridge.stop())
     bridge.run()
+    return 0
+
+
+def _make_site(args: argparse.Namespace) -> int:
+    from bridge.site import make_site
+    config = load(args.unit) if args.unit else None
+    fleet = config.unit.fleet if config else args.fleet
+    units = [*([config.unit.name] if config else []), *args.name] or ["tractor-1"]
+    hosts = args.host or list(dict.fromkeys([socket.gethostname(), "localhost", "127.0.0.1"]))
+    make_site(args.make_site, fleet, units, hosts)
+    folder = args.make_site.absolute()
+    print(f"site of {fleet} in {folder}; start its broker:\n\n  mosquitto -c {folder}/mosquitto.conf\n")
+    for unit in units:
+        print(f"{unit}: in its unit.toml\n\n  [bridge]\n  broker = \"mqtts://{hosts[0]}:8883\"\n  ca = \"{folder}/ca.pem\"\n"
+              f"  certificate = \"{folder}/{unit}.pem\"\n  key = \"{folder}/{unit}-key.pem\"\n")
+    print(f"level 2:\n\n  ucs level2 --broker mqtts://{hosts[0]}:8883 --fleet {fleet} --ca {folder}/ca.pem "
+          f"--certificate {folder}/level2.pem --key {folder}/level2-key.pem")
     return 0
 
 

@@ -21,7 +21,7 @@ it. Prints one line for each event; connections, silent units and gaps are told 
 """
 EPILOG = f"""\
 Without --broker it starts an embedded broker on {LISTEN}: good for a demonstration on one machine, not for a site, which
-runs mosquitto with certificates.
+runs mosquitto with certificates (`ucs bridge --make-site DIR` writes a pattern).
 """
 COMMAND = """\
 Sends one command to a unit and waits for its answer. Exit code 0: done; 1: refused, with the reason.

@@ -1,11 +1,13 @@
 """What the tests of the bridge are made of: a hand-driven level 2, a unit with a journal, waiting."""
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+import jsonschema
 import msgspec
 
 from bridge import wire
@@ -16,6 +18,10 @@ from level1.io.journal import Journal
 
 FLEET, UNIT = "north-farm", "tractor-7"
 M = TypeVar("M", bound=msgspec.Struct)
+_SCHEMAS = Path(wire.__file__).parent / "schema"
+_VALIDATORS = {kind: jsonschema.Draft202012Validator(json.loads((_SCHEMAS / f"{kind}.json").read_text(encoding="utf-8")))
+               for kind in wire.SCHEMAS}
+"""Whatever the tests receive is checked against what is published."""
 
 
 def an_event(seq: int, boot: int = 1) -> Event:
@@ -52,11 +58,20 @@ class Peer:
         """What came of a kind."""
         names = {content: name for name, content in wire.KINDS.items()}
         name = names[kind]  # type: ignore[index]
-        return [wire.decode(message.payload, kind) for message in self.received if wire.parse_topic(message.topic).kind == name]
+        found = [message.payload for message in self.received if wire.parse_topic(message.topic).kind == name]
+        for payload in found:
+            _VALIDATORS[name].validate(json.loads(payload))
+        return [wire.decode(payload, kind) for payload in found]
 
     def seqs(self) -> list[int]:
         """The seqs of the events that came, in the order in which they came."""
         return [alarm.seq for alarm in self.messages(wire.Alarm)]
+
+    def send_checked(self, kind: str, message: msgspec.Struct) -> None:
+        """Publish to the unit what keeps the published schema."""
+        payload = wire.encode(message)
+        _VALIDATORS[kind].validate(json.loads(payload))
+        self.send(kind, payload)
 
     def send(self, kind: str, payload: bytes) -> None:
         """Publish to the unit."""
@@ -64,7 +79,7 @@ class Peer:
 
     def acknowledge(self, boot: int, upto: int, also: tuple[tuple[int, int], ...] = (), unit: str = UNIT) -> None:
         """Say that events are on our disk."""
-        self.send("ack", wire.encode(wire.Ack(unit=unit, boot=boot, seq=upto, also=also, t=seconds(1))))
+        self.send_checked("ack", wire.Ack(unit=unit, boot=boot, seq=upto, also=also, t=seconds(1)))
 
 
 class Unit:

@@ -19,7 +19,7 @@ from bridge.session import BridgeThread
 from bridge.signing import signed
 from bridge.tests.peer import FLEET, UNIT, Peer, Unit, eventually
 from level1.command import Order
-from level1.event import Result, seconds
+from level1.event import Monitor, Result, seconds
 
 
 class Site:
@@ -137,6 +137,22 @@ def test_a_command_without_supervision_is_refused(site: Site) -> None:
     site.send()
     assert site.results(1, supervised=False) == [("c-1", 1, "refused", "supervision is not running")]
     site.link = RunLink(site.unit.path)
+
+
+def test_the_period_of_monitoring_is_lengthened_and_given_back(site: Site) -> None:
+    for seq, (value, outcome) in enumerate([(Decimal(10), "done"), (Decimal("0.001"), "refused"), (None, "done")], 1):
+        site.send(seq, name="monitor_period", value=value)
+        assert site.results(seq)[-1][2] == outcome
+    assert site.obeyed == []
+
+
+def test_a_longer_period_thins_the_monitoring_out(site: Site) -> None:
+    site.send(name="monitor_period", value=Decimal(3600))
+    site.results(1)
+    for number in range(20):
+        eventually(lambda: site.link.send_samples(Monitor(UNIT, 1, seconds(0), None, False, "motion", {}, {}, {})))
+        site.peer.until(lambda number=number: site.peer.connection.wait(0.02) is not None)  # type: ignore[misc]
+    assert len(site.peer.messages(wire.MonitorMessage)) <= 1
 
 
 def test_whoever_is_taken_out_of_the_key_file_commands_no_more(site: Site) -> None:

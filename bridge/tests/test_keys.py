@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import os
 import stat
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -31,11 +30,6 @@ def test_a_private_key_is_for_its_owner_alone_and_never_overwritten(tmp_path: Pa
     assert stat.S_IMODE((tmp_path / "chief.key").stat().st_mode) == 0o600
     with pytest.raises(KeyFileError, match="File exists"):
         make_private(tmp_path / "chief.key")
-
-
-def test_keys_of_openssl_will_do(tmp_path: Path) -> None:
-    subprocess.run(["openssl", "genpkey", "-algorithm", "ed25519", "-out", tmp_path / "chief.key"], check=True)
-    assert len(public_bytes(load_private(tmp_path / "chief.key"))) == 32
 
 
 def test_a_name_is_given_once(tmp_path: Path) -> None:

@@ -66,6 +66,22 @@ def test_level2_says_where_it_listens_and_ends_at_a_signal(tmp_path: Path) -> No
     assert (*level2.communicate(timeout=20), level2.returncode) == ("", "", 0)
 
 
+def test_a_site_is_made_and_how_to_use_it_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "unit.toml").write_text(CONFIG)
+    site = tmp_path / "site"
+    make = ["bridge", str(tmp_path / "unit.toml"), "--make-site", str(site), "--name", "tractor-8", "--host", "farm.local"]
+    assert main(make) == 0
+    told = capsys.readouterr().out
+    assert f"mosquitto -c {tmp_path}/site/mosquitto.conf" in told
+    assert "broker = \"mqtts://farm.local:8883\"" in told and f'key = "{tmp_path}/site/tractor-8-key.pem"' in told
+    assert "ucs/v1/farm/%u/alarm" in (tmp_path / "site" / "acl").read_text()
+    assert {"tractor-7.pem", "tractor-8.pem", "level2.pem", "broker.pem", "ca.pem"} <= {path.name for path in site.iterdir()}
+    assert main(make) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main(["bridge"]) == 2
+    assert "give the path of a unit.toml" in capsys.readouterr().err
+
+
 # Commands
 
 
