@@ -11,7 +11,7 @@ activation, locks the alarm out: safe state, held until a reset on board.
 
 From the first attempt to the end of the episode the repair owns its command messages: it repeats them at their cycle time,
 and the alarm signal on the bus reads Repairing, upon which other programs stop sending them. One message serves one repair at a
-time; an alarm of higher priority takes it from one of lower.
+time; an alarm of higher priority takes it from one of lower. A lock-out goes on holding those that are sent at a cycle time.
 
 An attempt does not start (it waits) while its feedback is unknown, its message belongs to another, or the unit is stopped or
 paused from above. A repair that is not armed runs passive: it reports once for each activation what it would have sent.
@@ -46,8 +46,11 @@ class Host(Protocol):
     def claim(self, owner: RepairMachine, t_ns: int, messages: Sequence[str]) -> str:
         """Own these command messages; gives the name of the alarm that keeps one, else an empty string."""
 
-    def release(self, owner: RepairMachine, t_ns: int) -> None:
-        """Hand all owned messages back."""
+    def release(self, owner: RepairMachine, t_ns: int, but: Sequence[str] = ()) -> None:
+        """Hand owned messages back, but not these."""
+
+    def is_cyclic(self, message: str) -> bool:
+        """Whether a command is sent again and again."""
 
     def transmit(self, owner: RepairMachine, t_ns: int, step: SendStep | ResendStep) -> None:
         """Send a step's frame and go on repeating it. Raises gate.Refused."""
@@ -98,6 +101,11 @@ class RepairMachine:
         """The command messages it needs, each once."""
         steps = (*self.definition.steps, *self.definition.give_up)
         return list(dict.fromkeys(step.message for step in steps if isinstance(step, (SendStep, ResendStep))))
+
+    @property
+    def lasting(self) -> list[str]:
+        """Those of them that a lock-out goes on holding; a command sent once leaves nothing to hold."""
+        return [message for message in self.messages if self.host.is_cyclic(message)]
 
     # --- what can happen to it --------------------------------------------------------------------------------------------
 
@@ -278,9 +286,10 @@ class RepairMachine:
         self.host.emit(self.alarm, t_ns, "locked_out", why, self.attempt)
         self.alarm.enter(t_ns, LOCKED_OUT)
         self._hold_safe_state(t_ns)
+        self.host.release(self, t_ns, self.lasting)
 
     def _hold_safe_state(self, t_ns: int) -> None:
-        self.host.claim(self, t_ns, self.messages)
+        self.host.claim(self, t_ns, self.lasting)
         self._safe_state(t_ns)
 
     def _safe_state(self, t_ns: int) -> None:

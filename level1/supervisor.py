@@ -600,9 +600,13 @@ class Supervisor:
         if hold.message.cycle_ns:
             self.timers.set(hold, t_ns + hold.message.cycle_ns)
 
-    def release(self, owner: RepairMachine, t_ns: int) -> None:
-        """Hand command messages back, and let those who wait for one try again."""
-        freed = [hold for hold in self._holds.values() if hold.owner is owner]
+    def is_cyclic(self, message: str) -> bool:
+        """Whether a command has a cycle time."""
+        return bool(self.catalog.messages[message].cycle_ns)
+
+    def release(self, owner: RepairMachine, t_ns: int, but: Sequence[str] = ()) -> None:
+        """Hand command messages back, but not these, and let those who wait for one try again."""
+        freed = [hold for hold in self._holds.values() if hold.owner is owner and hold.message.name not in but]
         for hold in freed:
             hold.owner = None
             hold.payload = b""

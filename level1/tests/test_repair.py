@@ -349,3 +349,20 @@ def test_a_stranger_on_a_held_message_does_not_get_into_the_repair() -> None:
     tool.target.receive(Frame(tool.now, frame_key(COMMAND.can_id, False), b"\x01\xaa" + bytes(6)))
     tool.run(30)
     assert {send.data[1] for send in sends(tool.outputs, "FLAMER_CMD")} == {0}
+
+
+def test_a_lock_out_goes_on_holding_cyclic_commands_only_so_that_others_can_use_what_is_sent_once() -> None:
+    restart = message("RESTART", 0x202, [signal("Device", 0, 8)], length=1, cycle_ns=None, senders=("UCS",))
+    sensors = message("SENSORS", 0x203, [signal("First", 0, 2), signal("Second", 2, 2)])
+    alarms = [alarm(name, compare(f"SENSORS.{name}", "==", 2), code, repair=Repair(
+        (SendStep("RESTART", {"Device": 7}), ExpectStep(compare(f"SENSORS.{name}", "==", 1), SECOND, "it works")), attempts=1))
+        for code, name in enumerate(("First", "Second"), 1)]
+    target = supervisor([restart, sensors], alarms)
+    outputs: list[Output] = []
+    for tick in range(100):
+        states = 0b1010 if 50 <= tick < 55 else 0b0110
+        outputs += target.receive(Frame(tick * 100 * MS, frame_key(0x203, False), bytes([states, *bytes(7)])))
+    assert [(name, word) for _, name, word in events(outputs)] == [
+        ("First", "raised"), ("First", "repair_started"), ("First", "repair_failed"), ("First", "locked_out"),
+        ("Second", "raised"), ("Second", "repair_started"), ("Second", "repaired"), ("Second", "cleared")]
+    assert [send.t_ns for send in sends(outputs, "RESTART")] == [0, 5 * SECOND]
