@@ -103,4 +103,4 @@ def journal_word(fault: str | None) -> str:
     """The word of the signal JournalState for a fault of the journal."""
     if fault is None:
         return "JournalOk"
-    return next((word for text, word in JOURNAL_WORDS if text in fault), "JournalFailed")
+    return next((word for text, word in JOURNAL_WORDS if text in fault.lower()), "JournalFailed")
