@@ -14,6 +14,7 @@ from level1.io import definitions
 from level1.io.definitions import Examination
 from level1.io.error import OutsideError
 from ucs.render import painted, wants_colour
+from ucs.table import aligned
 from ucs.words import abbreviated
 
 _SEVERITY_COLOURS = {"error": "1;31", "warning": "33"}
@@ -99,7 +100,7 @@ def _alarms(args: Namespace) -> int:
     elif sys.stdout.isatty():
         _print_table(alarms)
     else:
-        _print_aligned([_COLUMNS, *(_row(alarm) for alarm in alarms)])
+        print(*aligned([_COLUMNS, *(_row(alarm) for alarm in alarms)]), sep="\n")
     return 0
 
 
@@ -149,12 +150,6 @@ def _as_object(alarm: Alarm) -> dict[str, Any]:
         "off_delay_ms": alarm.off_delay_ns / 1_000_000, "latch": alarm.latch, "cause": alarm.cause,
         "consequence": alarm.consequence, "action": alarm.action, "comment": alarm.comment, "spn": alarm.spn, "fmi": alarm.fmi,
         "repair": repair, "file": alarm.file, "line": alarm.line}
-
-
-def _print_aligned(rows: Sequence[Sequence[str]]) -> None:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
 def _print_table(alarms: Sequence[Alarm]) -> None:

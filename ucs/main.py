@@ -30,6 +30,7 @@ COMMANDS = {
     "new": Command("ucs.new", "write a DBC file to start your own alarms from"),
     "run": Command("ucs.run", "supervise a unit live"),
     "replay": Command("ucs.replay", "run alarm definitions over recordings"),
+    "diff": Command("ucs.diff", "compare the alarms of two sets of definitions over recordings"),
     "simulate": Command("ucs.simulate", "simulate the nodes on the bus, with faults as a scenario says"),
     "bridge": Command("ucs.bridge", "carry a unit's events to level 2 and commands back"),
     "level2": Command("ucs.level2", "receive, store and acknowledge what units send"),
