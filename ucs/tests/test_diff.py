@@ -124,7 +124,11 @@ def test_an_interrupted_run_goes_on_where_it_was(folder: Path, monkeypatch: pyte
     assert len(list(cache.iterdir())) == 1
     worked: list[str] = []
     real = season.work
-    monkeypatch.setattr(season, "work", lambda job: worked.append(job.path) or real(job))
+
+    def watched(job: season.Job) -> season.Outcome:
+        worked.append(job.path)
+        return real(job)
+    monkeypatch.setattr(season, "work", watched)
     assert season.run(jobs, workers=1, cache=cache) == [real(job) for job in jobs]
     assert worked == [jobs[1].path] and list(cache.iterdir()) == []
 
