@@ -257,8 +257,10 @@ def signed_bytes(fleet: str, unit: str, body: str) -> bytes:
 
 
 def schemas() -> dict[str, str]:
-    """JSON Schema (draft 2020-12) of every message, by the name of its file."""
-    return {f"{name}.json": _schema(name, kind) for name, kind in SCHEMAS.items()}
+    """JSON Schema (draft 2020-12) of every message and the AsyncAPI description of all, by the name of its file."""
+    from bridge.asyncapi import describe
+    found = {f"{name}.json": _schema(name, kind) for name, kind in SCHEMAS.items()}
+    return found | {"asyncapi.json": msgspec.json.format(msgspec.json.encode(describe()), indent=2).decode() + "\n"}
 
 
 def _schema(name: str, kind: type[msgspec.Struct]) -> str:

@@ -74,6 +74,16 @@ def test_messages_keep_their_published_schema(kind: str) -> None:
     jsonschema.validate(json.loads(wire.encode(EXAMPLES[kind])), schema)
 
 
+def test_the_description_covers_every_kind_and_refers_to_its_schema() -> None:
+    described = json.loads((FOLDER / "asyncapi.json").read_text(encoding="utf-8"))
+    assert set(described["channels"]) == set(described["operations"]) == {*wire.KINDS} == {*wire.UP, *wire.DOWN}
+    for kind, channel in described["channels"].items():
+        assert (FOLDER / channel["messages"][kind]["payload"]["$ref"]).is_file()
+        address = channel["address"].format(fleet="farm", unit="t7", message="motion")
+        assert wire.parse_topic(address).kind == kind
+        assert described["operations"][kind]["action"] == ("receive" if kind in wire.UP else "send")
+
+
 def test_the_words_of_the_wire_are_those_of_the_core() -> None:
     fields = {field.name: field for field in msgspec.structs.fields(wire.Alarm)}
     assert set(get_args(fields["event"].type)) == set(EVENTS)
