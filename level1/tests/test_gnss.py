@@ -1,11 +1,8 @@
 """The receiver on its line: read live, lost, found again, never waited for."""
 from __future__ import annotations
 
-import os
-import pty
 import socket
 import time
-import tty
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -16,33 +13,10 @@ import pytest
 from level1.health import MOTION, POSITION, STATUS, TIME, Reading
 from level1.io.config import Gnss
 from level1.io.gnss import READINGS, GnssReceiver, Line, open_line
-from level1.tests.test_nmea import FIX, S, sentence
+from level1.tests.plug import FIX, Plug, sentence
 
 WAIT_S = 10.0
-
-
-class Plug:
-    """A pty that stands for the receiver's end of the line; `path` is where the unit finds it, while it is plugged."""
-
-    def __init__(self, path: Path):
-        self.path = path
-        self.master = -1
-        self.plug()
-
-    def plug(self) -> None:
-        self.master, slave = pty.openpty()
-        tty.setraw(slave)
-        self.path.unlink(missing_ok=True)
-        self.path.symlink_to(os.ttyname(slave))
-        self._slave = slave
-
-    def unplug(self) -> None:
-        self.path.unlink(missing_ok=True)
-        os.close(self._slave)
-        os.close(self.master)
-
-    def say(self, *bodies: str) -> None:
-        os.write(self.master, b"".join(map(sentence, bodies)))
+S = 1_000_000_000
 
 
 class Bench:
@@ -126,7 +100,7 @@ def test_unplugged_and_plugged_again_and_again(plug: Plug, bench: Callable[..., 
     one = bench(Gnss(str(plug.path)))
     for round_ in range(4):
         one.until(lambda: one.last(STATUS, "GnssReceiver") == "Receiving", lambda: plug.say(FIX))
-        os.write(plug.master, sentence(FIX)[:half])
+        plug.send(sentence(FIX)[:half])
         plug.unplug()
         one.until(lambda: one.last(STATUS, "GnssReceiver") == "Unplugged")
         assert len(one.notices) == 2 * round_ + 1 and "; trying again" in one.notices[-1]

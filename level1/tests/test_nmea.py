@@ -19,18 +19,10 @@ from level1.io.definitions import load
 from level1.navigation import HOLDOVER_NS, ClockOffset, Navigation, Place, jump_m
 from level1.nmea import FRESH_NS, FROZEN_NS, LEAD_NS, LONGEST, QUIET_NS, Framer, Navigator
 from level1.supervisor import Supervisor
+from level1.tests.plug import FIX, sentence
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data" / "gpsd-nmea0183"
 MS, S = 1_000_000, 1_000_000_000
-FIX = "GPGGA,120000.00,4807.038,N,01131.000,E,4,12,0.9,545.4,M,46.9,M,1.5,0133"
-
-
-def sentence(body: str) -> bytes:
-    """With its checksum and line end."""
-    total = 0
-    for byte in body.encode():
-        total ^= byte
-    return f"${body}*{total:02X}\r\n".encode()
 
 
 def gga(second: float = 0.0, latitude: str = "4807.038", fix: int = 4) -> bytes:
