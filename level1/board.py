@@ -539,19 +539,26 @@ class Board:
         return page
 
     def _find(self, key: int) -> Page | None:
-        page = None
-        if key in self._by_key:
-            page = self.pages[self._by_key[key][0]]
-        elif key & EXTENDED and not key & (REMOTE | ERROR_FRAME):
-            candidates = self._by_pgn.get((key >> BUS_SHIFT, j1939_pgn(key & 0x1FFF_FFFF)), [])
-            source = key & 0xFF
-            for wanted, name in candidates:
-                if wanted == source:
-                    page = self.pages[name]
-            for wanted, name in candidates:
-                if page is None and wanted is None:
-                    page = self._claim(self.pages[name], key)
+        page = self.fixed_page(key)
+        for candidate in self.open_pages(key):
+            page = page or self._claim(candidate, key)
         return page
+
+    def fixed_page(self, key: int) -> Page | None:
+        """The page that an identifier always belongs to, None if there is none."""
+        if key in self._by_key:
+            return self.pages[self._by_key[key][0]]
+        named = [name for source, name in self._candidates(key) if source == key & 0xFF]
+        return self.pages[named[-1]] if named else None
+
+    def open_pages(self, key: int) -> list[Page]:
+        """The pages that take the parameter group of an identifier from any source."""
+        return [self.pages[name] for source, name in self._candidates(key) if source is None]
+
+    def _candidates(self, key: int) -> list[tuple[int | None, str]]:
+        if key in self._by_key or not key & EXTENDED or key & (REMOTE | ERROR_FRAME):
+            return []
+        return self._by_pgn.get((key >> BUS_SHIFT, j1939_pgn(key & 0x1FFF_FFFF)), [])
 
     def _claim(self, page: Page, key: int) -> Page | None:
         if page.owner is None or page.stale_level == 0 or page.owner == key:

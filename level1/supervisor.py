@@ -17,7 +17,7 @@ from zlib import crc32
 import msgspec
 
 from level1.alarm import AlarmMachine
-from level1.board import ALWAYS, Board, Cell, Page, Watch
+from level1.board import ALWAYS, Board, Cell, Page, Tap, Watch
 from level1.canopen import DEVICE_EMERGENCY, DEVICE_SILENT, NMT, Device, Devices
 from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Alarm, Catalog, Command, Message, Repair
 from level1.command import Order
@@ -117,6 +117,7 @@ class Supervisor:
         self.timers = Timers()
         self.board = Board(catalog, self.timers)
         self.counters = self.board.counters
+        self.transport: Transport | None = None
         self.now_ns = start_ns if start_ns is not None else -FAR
         self._begun = False
         self._restored = restored
@@ -138,7 +139,7 @@ class Supervisor:
         self._compile()
         self._broadcasts = self._make_broadcasts() if broadcast else {}
         self._samplers = self._make_samplers(monitor_ns) if monitor_ns else []
-        self.gate = Gate(catalog, self._sendable(), frozenset(readings))
+        self.gate = Gate(catalog, self.sendable(), frozenset(readings))
         self._heard_ns = self.now_ns
         self._own_keys = frozenset(
             frame_key(message.can_id, message.extended, bus) for name in self._broadcasts
@@ -162,7 +163,7 @@ class Supervisor:
     def receive_many(self, frames: Iterable[tuple[int, int, bytes]]) -> list[Output]:
         """Frames in order; the same as `receive` for each, without its cost a call."""
         board, timers = self.board, self.timers
-        table, bind, queued, settle = board.table, board.bind, board.queued, board.settle
+        table, queued, settle = board.table, board.queued, board.settle
         last = self.now_ns
         if not self._begun:
             frames, last = self._begin_with(frames)
@@ -176,8 +177,7 @@ class Supervisor:
             try:
                 page = table[key]
             except KeyError:
-                self._heard_ns = t
-                page = bind(key)
+                page = self.meet(t, key)
             if page is None:
                 continue
             page.t_ns = t
@@ -282,6 +282,32 @@ class Supervisor:
             yield machine
             yield from list(self._reported[name].values())
 
+    # --- for `sieve`, which feeds blocks of frames ------------------------------------------------------------------------
+
+    @property
+    def watches(self) -> Sequence[Watch]:
+        """All conditions in use, in the order of their evaluation."""
+        return self._watches
+
+    def sendable(self) -> set[str]:
+        """Messages that this supervisor may send itself."""
+        return self._commanded() | {alarm.message for alarm in self.catalog.alarms.values()}
+
+    def begin(self, t_ns: int) -> None:
+        """Let the time line begin, unless it has."""
+        if not self._begun:
+            self._begin(t_ns)
+
+    def meet(self, t_ns: int, key: int) -> Page | Tap | None:
+        """The page of an identifier heard for the first time, or again for the first time since its page fell silent."""
+        self._heard_ns = t_ns
+        return self.board.bind(key)
+
+    def take(self, now_ns: int) -> list[Output]:
+        """The outputs so far; frames up to now have been received."""
+        self.now_ns = now_ns
+        return self._take()
+
     # --- time -------------------------------------------------------------------------------------------------------------
 
     def _begin_with(self, frames: Iterable[tuple[int, int, bytes]]) -> tuple[Iterable[tuple[int, int, bytes]], int]:
@@ -360,7 +386,8 @@ class Supervisor:
             self._raised.setdefault(name, deque())
             self._counts.append(_Window(self, name, window_ns, cell))
         if TROUBLE_CODE in self._alarms or things.codes or self._nodes:
-            self._listen(Transport(board.deliver, self.counters))
+            self.transport = Transport(board.deliver, self.counters)
+            self._listen(self.transport)
         if self._devices is not None:
             for can_id, listener in self._devices.listeners().items():
                 board.listen_to(can_id, listener)
@@ -454,9 +481,6 @@ class Supervisor:
                 names.update(step.message for step in (*alarm.repair.steps, *alarm.repair.give_up)
                              if isinstance(step, (SendStep, ResendStep)))
         return names
-
-    def _sendable(self) -> set[str]:
-        return self._commanded() | {alarm.message for alarm in self.catalog.alarms.values()}
 
     def _watch(self, evaluate: Callable[[], int], cells: Iterable[Cell], sink: Callable[[int, int], None], outcome: int) -> None:
         watch = Watch(len(self._watches), evaluate, sink, outcome)
