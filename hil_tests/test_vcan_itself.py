@@ -145,5 +145,5 @@ def test_the_runner_gives_the_commands_exit_status() -> None:
 
 
 def test_the_runner_stops_what_runs_too_long() -> None:
-    result = subprocess.run([sys.executable, vcan_run.__file__, "-t", "4", "sleep", "60"], capture_output=True, check=False)
+    result = subprocess.run([sys.executable, vcan_run.__file__, "-t", "15", "sleep", "60"], capture_output=True, check=False)
     assert result.returncode == vcan_run.TIMED_OUT
