@@ -16,8 +16,9 @@ from level1.expression import And, Arithmetic, Compare, Expression, Function, No
 from level1.io import config, definitions
 from level1.io.error import OutsideError, did_you_mean
 from ucs import season
+from ucs.comparison import Comparison, Recorded, Side, span_text
 from ucs.render import painted, wants_colour
-from ucs.spans import Behaviour, Change, Span, behaviour, changes, floods, spans
+from ucs.spans import Behaviour, Change, behaviour, changes, spans
 from ucs.table import aligned
 
 SAME, DIFFERENT = 0, 1
@@ -31,50 +32,6 @@ class Sweep(NamedTuple):
     alarm: str
     attribute: str
     values: tuple[str, ...]
-
-
-class Side(NamedTuple):
-    """One set of definitions and what it gave: spans of each recording, by its path."""
-
-    name: str
-    found: dict[str, list[Span]]
-
-
-class Recorded(NamedTuple):
-    """A recording that could be used. last: its last time stamp, s."""
-
-    path: str
-    start: float
-    last: float
-    hours: float
-
-
-class Comparison(NamedTuple):
-    """Two sides over the same recordings."""
-
-    old: Side
-    new: Side
-    recorded: list[Recorded]
-    changes: dict[str, list[Change]]
-    tolerance_s: float
-
-    @property
-    def hours(self) -> float:
-        """Length of all recordings."""
-        return sum(each.hours for each in self.recorded)
-
-    def alarms(self) -> list[str]:
-        """Every alarm that either side raised."""
-        return sorted({span.alarm for side in (self.old, self.new) for found in side.found.values() for span in found})
-
-    def behaviour(self, side: Side, alarm: str) -> Behaviour:
-        """How an alarm behaved on one side."""
-        return behaviour([(each.path, each.last, [span for span in side.found[each.path] if span.alarm == alarm])
-                          for each in self.recorded], self.hours)
-
-    def floods(self, side: Side) -> int:
-        """Floods of all alarms together."""
-        return sum(floods(side.found[each.path]) for each in self.recorded)
 
 
 def add_parser(commands: Any) -> None:
@@ -262,16 +219,6 @@ _SIGNS = {"appeared": ("+", "32"), "vanished": ("-", "31")}
 def _change_line(each: Recorded, change: Change, colour: bool) -> str:
     sign, code = _SIGNS.get(change.what, ("~", "33"))
     return f"{painted(sign, code, colour)} {Path(each.path).name}  {change.alarm:<28} {change.what:<16} {span_text(each, change)}"
-
-
-def span_text(each: Recorded, change: Change) -> str:
-    """When it stood before and after, s from the beginning of the recording."""
-    def text(span: Span | None) -> str:
-        if span is None:
-            return "not raised"
-        end = "the end" if span.end is None else f"{span.end - each.start:.3f} s"
-        return f"{span.start - each.start:.3f} s to {end}{', ' + span.outcome.replace('_', ' ') if span.outcome else ''}"
-    return f"{text(change.old)} → {text(change.new)}"
 
 
 def _behaviour_object(found: Behaviour) -> Mapping[str, Any]:

@@ -5,12 +5,9 @@ from collections.abc import Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from ucs.comparison import Comparison, Recorded, span_text
 from ucs.spans import Behaviour, Span
-
-if TYPE_CHECKING:
-    from ucs.diff import Comparison, Recorded
 
 WIDTH, LABEL, ROW = 760, 190, 26
 OLD, NEW = "#adb5bd", "#1864ab"
@@ -80,7 +77,6 @@ def _alarm_table(compared: Comparison) -> str:
 
 
 def _change_table(compared: Comparison) -> str:
-    from ucs.diff import span_text
     rows = "".join(f"<tr><td>{escape(Path(each.path).name)}</td><td>{escape(change.alarm)}</td><td>{change.what}</td>"
                    f"<td>{escape(span_text(each, change))}</td></tr>"
                    for each in compared.recorded for change in compared.changes[each.path])
