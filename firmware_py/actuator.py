@@ -1,8 +1,9 @@
 """A part that takes a commanded position after its response time: a valve, a relay, a clamp. It can jam.
 
 Theory of operation. A new target is a *try*; so is the old one again when, `RETRY_NS` after the last try, the part still
-stands elsewhere (a driver energises a solenoid again, not without end). A jammed part ignores tries; "for n commands" means
-that it ignores n of them and works again.
+stands elsewhere (a driver energises a solenoid again, not without end). Where the driver does not do that by itself
+(`retry_ns` None), `again` is one more try. A jammed part ignores tries; "for n commands" means that it ignores n of them and
+works again.
 """
 from __future__ import annotations
 
@@ -15,11 +16,15 @@ RETRY_NS = 1_000_000_000
 
 
 class Actuator(Generic[Position]):
-    """One such part. position: where it stands. response_ns: from a try that it obeys to the new position."""
+    """One such part. position: where it stands. response_ns: from a try that it obeys to the new position.
 
-    def __init__(self, position: Position, response_ns: int):
+    retry_ns: after this its driver tries once more by itself; None: only when it is told to.
+    """
+
+    def __init__(self, position: Position, response_ns: int, retry_ns: int | None = RETRY_NS):
         self.position = position
         self.response_ns = response_ns
+        self._retry_ns = retry_ns
         self._target = position
         self._arrives_ns: int | None = None
         self._tried_ns = 0
@@ -33,11 +38,17 @@ class Actuator(Generic[Position]):
             self._arrives_ns = None
             if target != self.position:
                 self._try(now_ns)
-        elif target != self.position and self._arrives_ns is None and now_ns - self._tried_ns >= RETRY_NS:
+        elif (target != self.position and self._arrives_ns is None and self._retry_ns is not None
+              and now_ns - self._tried_ns >= self._retry_ns):
             self._try(now_ns)
         if self._arrives_ns is not None and now_ns >= self._arrives_ns:
             self.position = target
             self._arrives_ns = None
+
+    def again(self, now_ns: int) -> None:
+        """One more try, if it stands elsewhere, does not move, and was not tried at this very moment."""
+        if self._target != self.position and self._arrives_ns is None and self._tried_ns != now_ns:
+            self._try(now_ns)
 
     def _try(self, now_ns: int) -> None:
         self._tried_ns = now_ns

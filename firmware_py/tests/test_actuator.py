@@ -52,3 +52,24 @@ def test_what_is_forced_away_is_tried_again() -> None:
     drive(actuator, "Open", 0, 200)
     actuator.force("Closed")
     assert drive(actuator, "Open", 200, 1000) == 300
+
+
+def test_without_retries_of_its_own_it_tries_again_only_when_told_to() -> None:
+    actuator = Actuator("Closed", 300 * MS, retry_ns=None)
+    actuator.jam(("Open",), 2)
+    assert drive(actuator, "Open", 0, 10_000) is None
+    actuator.again(10_000 * MS)
+    assert drive(actuator, "Open", 10_000, 20_000) is None, "the second command that it ignores"
+    actuator.again(20_000 * MS)
+    assert drive(actuator, "Open", 20_000, 30_000) == 20_300
+
+
+def test_again_while_it_moves_or_at_the_moment_of_a_try_is_no_further_try() -> None:
+    actuator = Actuator("Closed", 300 * MS, retry_ns=None)
+    actuator.jam(("Open",), 2)
+    actuator.advance(MS, "Open")
+    actuator.again(MS)
+    actuator.again(2 * MS)
+    actuator.again(3 * MS)
+    actuator.again(4 * MS)
+    assert drive(actuator, "Open", 10, 1000, 1) == 303
