@@ -31,11 +31,14 @@ COMMON_FAULTS = (
 class Node:
     """Base of the nodes. A subclass names its DBC node, messages, faults and settings, and gives the five methods at the end.
 
+    DBC: the file that defines it; MORE_DBC: further ones with messages that it sends or hears.
+
     name: how scenarios and stories call it. codec: of the DBC files it speaks. start_ns: when it is switched on.
     """
 
     TICK_NS: ClassVar[int] = 20_000_000
     DBC: ClassVar[str] = ""
+    MORE_DBC: ClassVar[tuple[str, ...]] = ()
     DBC_NODE: ClassVar[str] = ""
     SENDS: ClassVar[tuple[str, ...]] = ()
     HEARS: ClassVar[tuple[str, ...]] = ()
