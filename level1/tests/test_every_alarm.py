@@ -1,7 +1,8 @@
 """What every alarm of every shipped definition must do, whatever its condition: found, driven and judged by one class.
 
 For each alarm the test searches for values of its inputs that raise it and values that clear it, then plays both as traffic at
-the messages' own cycle times.
+the messages' own cycle times. Counters count and checksums are right, but for the alarms that ask for them: for those 0 stands for
+a counter or checksum that is right, 1 for one that is not.
 """
 from __future__ import annotations
 
@@ -23,6 +24,7 @@ from level1.event import Event
 from level1.expression import AlarmState, Boolean, Count, Elapsed, Expression, Number, Quality, Rate, SignalValue, Silent
 from level1.frame import EXTENDED, Frame, frame_key
 from level1.io.definitions import load
+from level1.protection import CHECKSUMS
 from level1.supervisor import Supervisor
 from level1.tests.build import MS, SECOND
 from level1.tests.reference import Reference
@@ -55,6 +57,12 @@ def asks_for(alarm: Alarm, *kinds: type) -> bool:
     return any(isinstance(node, kinds) for node in nodes(alarm))
 
 
+@cache
+def messages() -> dict[str, Message]:
+    """All shipped messages, unmonitored: the board then holds no more than the alarm asks for."""
+    return {name: msgspec.structs.replace(message, monitor_as="") for name, message in shipped().messages.items()}
+
+
 def alone(alarm: Alarm) -> Catalog:
     """The catalog with this alarm and those it asks for, unarmed and without repairs."""
     wanted, queue = {alarm.name}, [alarm]
@@ -64,7 +72,12 @@ def alone(alarm: Alarm) -> Catalog:
                 wanted.add(node.alarm)
                 queue.append(shipped().alarms[node.alarm])
     alarms = {name: msgspec.structs.replace(shipped().alarms[name], repair=None) for name in shipped().alarms if name in wanted}
-    return msgspec.structs.replace(shipped(), alarms=alarms, commands={})
+    return msgspec.structs.replace(shipped(), messages=messages(), alarms=alarms, commands={})
+
+
+def asks_for_integrity(alarm: Alarm) -> bool:
+    """Whether it asks for the counter or checksum of a message."""
+    return any(isinstance(node, Quality) and node.kind in ("corrupt", "frozen") for node in nodes(alarm))
 
 
 class Player:
@@ -76,6 +89,7 @@ class Player:
         self.target.tick(0)
         self.watch = self.target._watches[list(self.target.catalog.alarms).index(alarm.name)]
         self.now = 0
+        self.made = 0
         self.events: list[Event] = []
         self.zones: list[tuple[int, int]] = []
         sink = self.watch.sink
@@ -109,8 +123,24 @@ class Player:
     def frame(self, name: str, values: Values, t_ns: int) -> Frame:
         message = self.target.catalog.messages[name]
         can_id = message.can_id & ~0xFF | SOURCE if message.j1939 and message.source is None else message.can_id
-        payload = encode(message, {signal: raw for (owner, signal), raw in values.items() if owner == name})
+        raws = {signal: raw for (owner, signal), raw in values.items() if owner == name}
+        is_protected = any(signal.role != "None" for signal in message.signals)
+        payload = self.protected(message, raws) if is_protected else encode(message, raws)
         return Frame(t_ns, frame_key(can_id, message.extended), payload)
+
+    def protected(self, message: Message, raws: dict[str, int]) -> bytes:
+        """A payload with its counter and checksum."""
+        roles = {signal.role: signal for signal in message.signals}
+        wrong = {role: bool(raws.pop(signal.name, 0)) for role, signal in roles.items() if role != "None"}
+        if (counter := roles.get("Counter")) is not None and not wrong["Counter"]:
+            self.made += 1
+            raws[counter.name] = self.made % (1 << counter.length)
+        payload = encode(message, raws)
+        if (checksum := roles.get("Checksum")) is not None:
+            place = checksum.start // 8
+            value = CHECKSUMS[checksum.checksum](payload[:place] + payload[place + 1:]) ^ (0xFF if wrong["Checksum"] else 0)
+            payload = payload[:place] + bytes([value]) + payload[place + 1:]
+        return payload
 
 
 def inputs(alarm: Alarm) -> list[tuple[Message, Signal]]:
@@ -119,6 +149,9 @@ def inputs(alarm: Alarm) -> list[tuple[Message, Signal]]:
     for node in nodes(alarm):
         if isinstance(node, (SignalValue, Rate, Elapsed, Quality, Silent)):
             message = shipped().messages[node.message]
+            if isinstance(node, Quality) and node.kind in ("corrupt", "frozen"):
+                found |= {(message.name, signal.name): (message, signal) for signal in message.signals if signal.role != "None"}
+                continue
             name = getattr(node, "signal", "") or message.signals[0].name
             found[message.name, name] = (message, message.signal(name))
         elif isinstance(node, (AlarmState, Count)):
@@ -128,6 +161,8 @@ def inputs(alarm: Alarm) -> list[tuple[Message, Signal]]:
 
 def choices(alarm: Alarm, message: Message, signal: Signal, wrong: bool) -> list[int]:
     """Raw values worth trying: the ends of every class that any constant of the conditions makes."""
+    if signal.role != "None":
+        return [0, 1]
     classes = Classes(signal, message.j1939, {node.value for node in nodes(alarm) if isinstance(node, Number)})
     found = {raw for low, high, quality in zip(classes.low, classes.high, classes.quality, strict=True)
              if wrong or quality == GOOD for raw in (low, high, (low + high) // 2)}
@@ -257,7 +292,9 @@ class TestEveryAlarm:
             player.play(on | {(message.name, signal.name): bad}, alarm.off_delay_ns + 10 * SECOND, quiet)
             assert [word for _, word in player.told()] == ["raised"] or player.watch.evaluate() == Zone.CLEAR
 
-    @every(Silent, Elapsed, AlarmState, Rate)
+    @pytest.mark.parametrize("name", [
+        name for name in NAMES if not asks_for(shipped().alarms[name], Silent, Elapsed, AlarmState, Rate)
+        and not asks_for_integrity(shipped().alarms[name])])
     def test_at_each_limit_and_one_step_past_it_the_verdict_is_that_of_the_slow_interpreter(self, name: str) -> None:
         alarm = shipped().alarms[name]
         on, _ = search(name, Zone.RAISE)
