@@ -139,11 +139,10 @@ def test_the_scenario_of_the_readme_runs() -> None:
 
 
 def test_every_phrase_of_every_program_can_be_written() -> None:
-    for program in PROGRAMS.values():
-        for phrase in program.FAULTS:
-            node = next(name for name, plan in (("flamer", "flaming_tool"), ("mission", "mission_controller"))
-                        if PROGRAMS[plan] is program)
-            subject = f"{node}.{phrase.device}" if phrase.device else node
+    for program, node in PROGRAMS.items():
+        for phrase in node.FAULTS:
+            subject = f"node.{phrase.device}" if phrase.device else "node"
             index = "[1]" if phrase.count else ""
-            (step, *_) = read(f'faults = ["at 1 s: {subject}{index} {phrase.action}"]\n').steps
+            text = f'faults = ["at 1 s: {subject}{index} {phrase.action}"]\n[nodes.node]\nprogram = "{program}"\n'
+            (step, *_) = parse(text, "test.toml").steps
             assert step.statement.action == phrase.action

@@ -25,7 +25,7 @@ from ucs.simulated_unit import SimulatedUnit
 
 ROOT = Path(__file__).parents[2]
 SECOND = 1_000_000_000
-SCENARIOS = sorted(file.name for file in SHIPPED.glob("*.toml"))
+SCENARIOS = sorted(file.name for file in SHIPPED.glob("*.toml") if '"flaming_tool"' in file.read_text("utf-8"))
 NODES = '[nodes.flamer]\nprogram = "flaming_tool"\n[nodes.mission]\nprogram = "mission_controller"\n'
 
 
