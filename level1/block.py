@@ -1,0 +1,102 @@
+"""A block of frames in columns: what the readers of recordings hand on, thousands of frames at a time."""
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from level1.frame import Frame
+
+HEAD_BYTES = 8
+"""Payload bytes that every frame has in the column `head`."""
+MAX_TALKERS = 65_536
+"""Different keys that one block can hold: a recording of random identifiers is cut into more blocks."""
+
+Ints = npt.NDArray[np.int64]
+Words = npt.NDArray[np.uint64]
+
+
+class Block:
+    """Frames in the order of the recording, one row each.
+
+    t_ns: time stamps as recorded; they may run backwards. talker: index into `keys` (`Frame.key`). length: payload bytes.
+    head: the first eight payload bytes as a little-endian integer, zero beyond the end. wide_rows: rows of the frames longer
+    than that, rising; wide: their whole payloads, zero beyond the end, `HEAD_BYTES` columns more than the longest.
+    """
+
+    __slots__ = ("head", "keys", "length", "t_ns", "talker", "wide", "wide_rows")
+
+    def __init__(self, t_ns: Ints, talker: npt.NDArray[np.uint16], keys: Sequence[int], length: npt.NDArray[np.uint16], head: Words,
+                 wide_rows: Ints | None = None, wide: npt.NDArray[np.uint8] | None = None):
+        self.t_ns = t_ns
+        self.talker = talker
+        self.keys = keys
+        self.length = length
+        self.head = head
+        self.wide_rows = wide_rows if wide_rows is not None else np.zeros(0, np.int64)
+        self.wide = wide if wide is not None else np.zeros((0, HEAD_BYTES), np.uint8)
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @classmethod
+    def of(cls, frames: Iterable[tuple[int, int, bytes]]) -> Block:
+        """The block of some frames; for formats read frame by frame, and for tests."""
+        rows = list(frames)
+        numbers: dict[int, int] = {}
+        talker = np.array([numbers.setdefault(key, len(numbers)) for _, key, _ in rows], np.uint16)
+        length = np.array([len(data) for _, _, data in rows], np.uint16)
+        head = np.frombuffer(b"".join(data[:HEAD_BYTES].ljust(HEAD_BYTES, b"\0") for _, _, data in rows), "<u8")
+        wide_rows = np.flatnonzero(length > HEAD_BYTES)
+        longest = int(length.max(initial=0)) + HEAD_BYTES
+        wide = np.frombuffer(b"".join(rows[row][2].ljust(longest, b"\0") for row in wide_rows), np.uint8)
+        return cls(np.array([t_ns for t_ns, _, _ in rows], np.int64), talker, list(numbers), length, head.astype(np.uint64),
+                   wide_rows, wide.reshape(len(wide_rows), longest))
+
+    def payload(self, row: int) -> bytes:
+        """The payload of one frame."""
+        size = int(self.length[row])
+        if size <= HEAD_BYTES:
+            return int(self.head[row]).to_bytes(HEAD_BYTES, "little")[:size]
+        return self.wide[self.wide_rows.searchsorted(row), :size].tobytes()
+
+    def payloads(self, rows: Ints) -> list[bytes]:
+        """The payloads of some frames."""
+        heads = self.head[rows].astype("<u8").tobytes()
+        lengths = self.length[rows].tolist()
+        found = [heads[at:at + size] if size < HEAD_BYTES else heads[at:at + HEAD_BYTES]
+                 for at, size in zip(range(0, len(heads), HEAD_BYTES), lengths, strict=True)]
+        for place in np.flatnonzero(self.length[rows] > HEAD_BYTES).tolist():
+            at = int(np.searchsorted(self.wide_rows, rows[place]))
+            found[place] = self.wide[at, :lengths[place]].tobytes()
+        return found
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames, one by one."""
+        payloads = self.payloads(np.arange(len(self)))
+        for t_ns, talker, data in zip(self.t_ns.tolist(), self.talker.tolist(), payloads, strict=True):
+            yield Frame(t_ns, self.keys[talker], data)
+
+    def window(self, rows: Ints, first: int) -> Words:
+        """Payload bytes first … first + 7 of some frames as little-endian integers, zero beyond the end."""
+        if first == 0:
+            return self.head[rows]
+        words: Words = np.zeros(len(rows), np.uint64)
+        head_part = self.head[rows] >> np.uint64(8 * first) if first < HEAD_BYTES else words
+        if not len(self.wide_rows):
+            return head_part
+        at = np.searchsorted(self.wide_rows, rows)
+        at[at == len(self.wide_rows)] = 0
+        is_wide = self.wide_rows[at] == rows
+        words = np.where(is_wide, self._wide_words(first)[at], head_part)
+        return words
+
+    def _wide_words(self, first: int) -> Words:
+        width = self.wide.shape[1]
+        if first + HEAD_BYTES > width:
+            return np.zeros(len(self.wide), np.uint64)
+        raw: Any = np.ascontiguousarray(self.wide[:, first:first + HEAD_BYTES])
+        words: Words = raw.view("<u8")[:, 0].astype(np.uint64)
+        return words
