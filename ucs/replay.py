@@ -1,26 +1,32 @@
 """`ucs replay`: alarm definitions over recordings, as fast as it can; every repair only reported."""
 from __future__ import annotations
 
+import os
 import sys
 import time
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from typing import Any, BinaryIO, TextIO
+from typing import Any, BinaryIO, NamedTuple, TextIO
 
 from level1.catalog import NORMAL, Catalog
 from level1.event import Event, Send, encode, seconds
-from level1.frame import BUS_SHIFT, ERROR, REMOTE, frame_key, j1939_pgn
 from level1.io import config, definitions
 from level1.io.error import OutsideError
+from level1.io.merged import MergedLog
 from level1.io.replay import Log
 from level1.supervisor import STATE_WORDS, Supervisor
+from ucs import parquet, season
+from ucs.diff import add_season_arguments
+from ucs.remarks import remarks
 from ucs.render import WORDS, event_line, painted, since, wants_colour
 
 UNIT, BOOT = "replay", 1
 """Identity of a replay's events; every recording is a run of its own, so that it gives the same bytes beside others."""
 PROGRESS_S = 0.2
+POOL_BYTES = 8 << 20
+"""Recordings smaller than this together are not worth other processes (each takes about a second to start)."""
 
 
 def add_parser(commands: Any) -> None:
@@ -31,12 +37,15 @@ def add_parser(commands: Any) -> None:
                     "in the time of the recording. Every repair counts as armed unless --unit-toml says otherwise; its "
                     "frames are only reported.",
         epilog="Example: ucs replay drive.log --dbc isobus_tractor.dbc --events drive.jsonl")
-    parser.add_argument("log", nargs="+", metavar="LOG", help="recording; each is a run of its own")
+    parser.add_argument("log", nargs="+", metavar="LOG", help="recordings, folders of them, patterns; each is a run of its own")
     parser.add_argument("--dbc", nargs="+", default=[], metavar="FILE", help="definitions; shipped ones go by name alone")
     parser.add_argument("--events", metavar="OUT.jsonl", help="write each event as a line of JSON; - for standard output")
+    parser.add_argument("--parquet", metavar="OUT.parquet", help="write the events as a table for DuckDB, Polars and the like")
     parser.add_argument("--unit-toml", metavar="FILE", help="which repairs are armed, which files belong to which bus")
     parser.add_argument("--bus", action="append", default=[], metavar="NAME=INDEX", type=_bus,
-                        help="take this channel of the recording as the bus of that index (from 0)")
+                        help="take this channel of the recording (with --merge also: this file) as the bus of that index (from 0)")
+    parser.add_argument("--merge", action="store_true", help="the recordings are of one drive: one run, in the order of time")
+    add_season_arguments(parser)
 
 
 def run(args: Namespace) -> int:
@@ -44,25 +53,36 @@ def run(args: Namespace) -> int:
     unit = config.load(args.unit_toml) if args.unit_toml else None
     if not args.dbc and unit is None:
         raise OutsideError("no definitions: give --dbc FILE …, or --unit-toml FILE")
+    paths = season.recordings(args.log)
     catalog = definitions.load(args.dbc) if args.dbc or unit is None else definitions.load((), unit.bus_files, unit.bus_names)
     if unit:
         config.check_armed(unit, catalog)
-    armed = unit.repairs.armed if unit else None
-    buses = {**(_bus_names(unit) if unit and not args.dbc else {}), **dict(args.bus)}
+    task = _Task(catalog, tuple(unit.repairs.armed) if unit else None,
+                 {**(_bus_names(unit) if unit and not args.dbc else {}), **dict(args.bus)}, tuple(name for name, _ in args.bus))
     with ExitStack() as stack:
-        events = _events_file(args.events, stack)
-        text = sys.stderr if args.events == "-" else sys.stdout
-        failed = 0
-        for path in args.log:
-            try:
-                replay = Replay(Log(path, buses, one_bus=not buses), catalog, armed)
-                _replay(replay, events, text)
-                for line in _remarks(replay, catalog, {name for name, _ in args.bus}):
-                    print(f"ucs: {path}: {line}", file=sys.stderr)
-            except OutsideError as error:
-                failed += 1
-                print(f"ucs: {error}", file=sys.stderr)
-    return 2 if failed else 0
+        out = _Out(args, stack)
+        if len(paths) > 1 and not args.merge:
+            return _run_season(paths, task, args, out)
+        return _run_one(paths, task, out)
+
+
+class _Task(NamedTuple):
+    """What to run over each recording."""
+
+    catalog: Catalog
+    armed: tuple[str, ...] | None
+    buses: dict[str, int]
+    asked: tuple[str, ...]
+
+    def replay(self, paths: Sequence[str]) -> Replay:
+        """Of one recording, or of several as one. Raises LogError."""
+        one_bus = not self.buses
+        log = Log(paths[0], self.buses, one_bus=one_bus) if len(paths) == 1 else MergedLog(paths, self.buses, one_bus=one_bus)
+        return Replay(log, self.catalog, self.armed)
+
+    def job(self, path: str, catalog: bytes) -> season.Job:
+        """The same, for another process."""
+        return season.Job(path, catalog, self.armed, self.buses, self.asked)
 
 
 class Replay:
@@ -71,7 +91,7 @@ class Replay:
     counts: (alarm, event) -> how often. sends: frames that repairs would have sent. keys: of all frames seen.
     """
 
-    def __init__(self, log: Log, catalog: Catalog, armed: Collection[str] | None):
+    def __init__(self, log: Log | MergedLog, catalog: Catalog, armed: Collection[str] | None):
         self.log = log
         self.supervisor = Supervisor(catalog, unit=UNIT, boot=BOOT, armed=armed, broadcast=False)
         self.counts: Counter[tuple[str, str]] = Counter()
@@ -87,6 +107,14 @@ class Replay:
             yield self._events(self.supervisor.receive_many(batch))
         yield self._events(self.supervisor.tick(self.log.last_ns))
 
+    def outcome(self, asked: Iterable[str], events: tuple[bytes, ...] = ()) -> season.Outcome:
+        """What came of it, once all batches were taken. asked: channels that the user named."""
+        log, supervisor = self.log, self.supervisor
+        standing = {name: STATE_WORDS[state] for name, state in supervisor.alarm_states().items() if state != NORMAL}
+        told = tuple(remarks(log, supervisor.counters, self.keys, supervisor.catalog, asked))
+        return season.Outcome(str(log.path), events, log.frames_read, log.first_ns, log.last_ns, log.skipped, standing, self.sends,
+                              told)
+
     def _events(self, outputs: Iterable[Any]) -> list[Event]:
         events = []
         for output in outputs:
@@ -98,10 +126,109 @@ class Replay:
         return events
 
 
+class _Out:
+    """Where the results go: JSON lines, Parquet, and text for people."""
+
+    def __init__(self, args: Namespace, stack: ExitStack):
+        self._events = _events_file(args.events, stack)
+        self._table = stack.enter_context(parquet.table(args.parquet)) if args.parquet else None
+        self.text = sys.stderr if args.events == "-" else sys.stdout
+        self.colour = wants_colour(self.text)
+        self.failed = 0
+
+    def begin(self, path: str) -> None:
+        """A recording begins."""
+        print(painted(path, "1", self.colour), file=self.text)
+
+    def event(self, path: str, first_ns: int, event: Event, line: bytes) -> None:
+        """One event, also as its line of JSON."""
+        if self._events:
+            self._events.write(line + b"\n")
+        if self._table:
+            self._table.add(path, [event])
+        print(event_line(event, since(event.t, seconds(first_ns)), self.colour), file=self.text)
+
+    def end(self, outcome: season.Outcome, counts: Counter[tuple[str, str]], took_s: float | None = None) -> None:
+        """The summary of a recording, and what was odd."""
+        print(*_summary(outcome, counts, took_s), sep="\n", file=self.text, flush=True)
+        for line in outcome.remarks:
+            print(f"ucs: {outcome.path}: {line}", file=sys.stderr)
+
+    def error(self, text: str) -> None:
+        """A recording that could not be used."""
+        self.failed += 1
+        print(f"ucs: {text}", file=sys.stderr)
+
+    def outcome(self, outcome: season.Outcome) -> None:
+        """A recording that another process has done."""
+        if outcome.error:
+            self.error(outcome.error)
+            return
+        self.begin(outcome.path)
+        counts: Counter[tuple[str, str]] = Counter()
+        for line, event in zip(outcome.events, outcome.decoded(), strict=True):
+            counts[event.alarm, event.event] += 1
+            self.event(outcome.path, outcome.first_ns, event, line)
+        self.end(outcome, counts)
+
+
+def _run_one(paths: Sequence[str], task: _Task, out: _Out) -> int:
+    """One recording, or several as one: told as it is read."""
+    try:
+        replay = task.replay(paths)
+        started, name = time.perf_counter(), str(replay.log.path)
+        progress = _Progress(sys.stderr, replay.log)
+        out.begin(name)
+        for batch in replay.batches():
+            progress.clear()
+            for event in batch:
+                out.event(name, replay.log.first_ns, event, encode(event))
+            progress.show(replay.log.frames_read)
+        progress.clear()
+        out.end(replay.outcome(task.asked), replay.counts, time.perf_counter() - started)
+    except OutsideError as error:
+        out.error(str(error))
+    return 2 if out.failed else 0
+
+
+def _run_season(paths: Sequence[str], task: _Task, args: Namespace, out: _Out) -> int:
+    """Many recordings, in several processes or on a cluster; the results in the order of the arguments."""
+    catalog = season.encoded(task.catalog)
+    jobs = [task.job(path, catalog) for path in paths]
+    started, waiting, done = time.perf_counter(), iter(paths), dict[str, season.Outcome]()
+    told, frames, following = 0, 0, next(waiting, None)
+    try:
+        with season.progress(len(jobs), sys.stderr) as show:
+            def take(outcome: season.Outcome) -> None:
+                nonlocal told, frames, following
+                told, frames = told + 1, frames + outcome.frames
+                done[outcome.path] = outcome
+                if following in done and sys.stderr.isatty():
+                    print(end="\r\033[K", file=sys.stderr, flush=True)
+                while following in done:
+                    out.outcome(done.pop(following))
+                    following = next(waiting, None)
+                show(outcome)
+            season.run(jobs, workers=args.jobs or _workers(paths, args.scheduler), scheduler=args.scheduler,
+                       cache=season.cache_folder(), fresh=args.fresh, told=take)
+    except KeyboardInterrupt:
+        print(f"ucs: {told} of {len(jobs)} recordings are done and kept; the same command goes on from there", file=sys.stderr)
+        raise
+    took_s = time.perf_counter() - started
+    print(f"{len(jobs)} recordings, {frames:,} frames in {took_s:.3f} s ({frames / took_s:,.0f} frames/s)", file=out.text)
+    return 2 if out.failed else 0
+
+
+def _workers(paths: Sequence[str], scheduler: str | None) -> int | None:
+    """1 where processes would cost more than they bring, else None."""
+    size = sum(os.stat(path).st_size for path in paths if os.path.exists(path))
+    return 1 if scheduler is None and size < POOL_BYTES else None
+
+
 class _Progress:
     """How far a long recording is, on a terminal."""
 
-    def __init__(self, stream: TextIO, log: Log):
+    def __init__(self, stream: TextIO, log: Log | MergedLog):
         self._stream, self._log = stream, log
         self._next = time.monotonic() + PROGRESS_S if stream.isatty() else float("inf")
         self._shown = False
@@ -122,74 +249,21 @@ class _Progress:
             self._shown = False
 
 
-def known_ids(catalog: Catalog, keys: Iterable[int]) -> set[int]:
-    """Those keys of frames that belong to a message of the catalog."""
-    exact, groups = set(), set()
-    for message in catalog.messages.values():
-        for bus in catalog.buses.get(message.name, (0,)):
-            if message.j1939 and message.pgn is not None:
-                groups.add((bus, message.pgn, message.source))
-            else:
-                exact.add(frame_key(message.can_id, message.extended, bus))
-    return {key for key in keys if key in exact or any(
-        (key >> BUS_SHIFT, j1939_pgn(key & 0x1FFFFFFF), source) in groups for source in (None, key & 0xFF))}
-
-
-def _replay(replay: Replay, events: BinaryIO | None, text: TextIO) -> None:
-    """One recording: its events and its summary."""
-    log = replay.log
-    progress, colour, started = _Progress(sys.stderr, log), wants_colour(text), time.perf_counter()
-    print(painted(str(log.path), "1", colour), file=text)
-    for batch in replay.batches():
-        progress.clear()
-        for event in batch:
-            if events:
-                events.write(encode(event) + b"\n")
-            print(event_line(event, since(event.t, seconds(log.first_ns)), colour), file=text)
-        progress.show(log.frames_read)
-    progress.clear()
-    print(*_summary(replay, time.perf_counter() - started), sep="\n", file=text, flush=True)
-
-
-def _summary(replay: Replay, took_s: float) -> Iterator[str]:
+def _summary(outcome: season.Outcome, counts: Counter[tuple[str, str]], took_s: float | None) -> Iterator[str]:
     """What was read, how fast, and each alarm's count."""
-    log, supervisor = replay.log, replay.supervisor
-    duration_s = (log.last_ns - log.first_ns) / 1e9
-    yield (f"  {log.frames_read:,} frames, {duration_s:,.3f} s of recording in {took_s:.3f} s "
-           f"({log.frames_read / took_s:,.0f} frames/s)")
-    standing = supervisor.alarm_states()
-    alarms = sorted({alarm for alarm, _ in replay.counts})
+    duration_s = (outcome.last_ns - outcome.first_ns) / 1e9
+    speed = "" if took_s is None else f" in {took_s:.3f} s ({outcome.frames / took_s:,.0f} frames/s)"
+    yield f"  {outcome.frames:,} frames, {duration_s:,.3f} s of recording{speed}"
+    alarms = sorted({alarm for alarm, _ in counts})
     for alarm in alarms:
-        counts = ", ".join(f"{replay.counts[alarm, word]} × {WORDS[word]}" for word in WORDS if replay.counts[alarm, word])
-        end = f"; at the end {STATE_WORDS[standing[alarm]]}" if standing[alarm] != NORMAL else ""
-        yield f"  {alarm:<28} {counts}{end}"
+        words = ", ".join(f"{counts[alarm, word]} × {WORDS[word]}" for word in WORDS if counts[alarm, word])
+        end = f"; at the end {outcome.standing[alarm]}" if alarm in outcome.standing else ""
+        yield f"  {alarm:<28} {words}{end}"
     if not alarms:
         yield "  no alarm"
-    if replay.sends:
-        yield f"  repairs would have sent {replay.sends:,} frames"
+    if outcome.sends:
+        yield f"  repairs would have sent {outcome.sends:,} frames"
     yield ""
-
-
-def _remarks(replay: Replay, catalog: Catalog, asked: set[str]) -> Iterator[str]:
-    """What was odd about the recording. asked: channels that `--bus` names."""
-    log = replay.log
-    if log.skipped:
-        yield f"{log.complaints[0]}; {log.skipped:,} {'line' if log.skipped == 1 else 'lines'} skipped in all"
-    if log.error_frames or log.remote_frames:
-        yield f"{log.error_frames:,} error frames, {log.remote_frames:,} remote frames"
-    if backwards := replay.supervisor.counters["time stamps that ran backwards"]:
-        yield f"{backwards:,} time stamps ran backwards and were taken as the highest before them"
-    data = {key for key in replay.keys if not key & (ERROR | REMOTE)}
-    if data and not known_ids(catalog, data):
-        yield (f"none of the {len(data)} ids in this recording ({_some_ids(data)}) is in these definitions; "
-               "give the DBC files of the machine that was recorded")
-    for name in sorted(asked - log.channels_seen):
-        yield f"no frame of a channel {name}; its channels: {', '.join(sorted(log.channels_seen))}"
-
-
-def _some_ids(keys: Iterable[int]) -> str:
-    names = [f"{key & 0x1FFFFFFF:0{8 if key >> 31 & 1 else 3}X}" for key in sorted(keys)]
-    return ", ".join(names[:5]) + (", …" if len(names) > 5 else "")
 
 
 def _events_file(path: str | None, stack: ExitStack) -> BinaryIO | None:

@@ -10,6 +10,7 @@ import glob
 import hashlib
 import importlib
 import os
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -30,22 +31,26 @@ SUFFIXES = (".log", ".candump", ".txt", ".asc", ".blf", ".trc", ".csv", ".mf4", 
 
 
 class Job(msgspec.Struct, frozen=True):
-    """A recording and what to run over it. catalog: a `Catalog` as msgpack; armed: alarms whose repairs act, None for all."""
+    """A recording and what to run over it. catalog: a `Catalog` as msgpack; armed: alarms whose repairs act, None for all.
+    asked: channels that the user named."""
 
     path: str
     catalog: bytes
     armed: tuple[str, ...] | None = None
     buses: dict[str, int] = {}
+    asked: tuple[str, ...] = ()
 
     def key(self) -> str:
         """Names the outcome: the same key, the same bytes."""
         state = os.stat(self.path)
-        parts = (os.path.abspath(self.path), state.st_size, state.st_mtime_ns, self.armed, sorted(self.buses.items()), _version())
+        parts = (os.path.abspath(self.path), state.st_size, state.st_mtime_ns, self.armed, sorted(self.buses.items()), self.asked,
+                 _version(), Outcome.__struct_fields__)
         return hashlib.sha256(repr(parts).encode() + self.catalog).hexdigest()[:32]
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What came of a job. events: JSON lines. error: why the recording could not be used, else empty."""
+    """What came of a job. events: JSON lines. standing: state of each alarm that is not normal at the end. sends: frames that
+    repairs would have sent. remarks: what was odd. error: why the recording could not be used, else empty."""
 
     path: str
     events: tuple[bytes, ...] = ()
@@ -53,6 +58,9 @@ class Outcome(msgspec.Struct, frozen=True):
     first_ns: int = 0
     last_ns: int = 0
     skipped: int = 0
+    standing: dict[str, str] = {}
+    sends: int = 0
+    remarks: tuple[str, ...] = ()
     error: str = ""
 
     def decoded(self) -> list[Event]:
@@ -104,7 +112,7 @@ def work(job: Job) -> Outcome:
         events = tuple(encode(event) for batch in replay.batches() for event in batch)
     except (OutsideError, OSError) as error:
         return Outcome(job.path, error=str(error))
-    return Outcome(job.path, events, log.frames_read, log.first_ns, log.last_ns, log.skipped)
+    return replay.outcome(job.asked, events)
 
 
 @contextmanager
@@ -157,7 +165,8 @@ def _computed(jobs: Sequence[Job], todo: Sequence[int], workers: int | None,
             yield number, work(jobs[number])
         return
     with _executor(count, scheduler) as executor:
-        futures: dict[Future[Outcome], int] = {executor.submit(work, jobs[number]): number for number in todo}
+        with _uninterrupted():
+            futures: dict[Future[Outcome], int] = {executor.submit(work, jobs[number]): number for number in todo}
         completed = as_completed if scheduler is None else _as_completed_on_cluster
         for future in completed(futures):
             yield futures[future], future.result()
@@ -183,6 +192,17 @@ def _executor(count: int, scheduler: str | None) -> Iterator[Executor]:
             process.terminate()
         raise
     executor.shutdown()
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Within it Ctrl-C waits; processes started in it never see one. A terminal sends it to all of them, and only the first
+    is to answer: it ends the others."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
