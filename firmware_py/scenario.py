@@ -26,17 +26,31 @@ from difflib import get_close_matches
 from random import Random
 from typing import Any
 
+from firmware_py.airblast_mission import AirblastMission
+from firmware_py.airblast_sprayer import AirblastSprayer
 from firmware_py.codec import Codec
 from firmware_py.fault import WORKS, Phrase, Statement
 from firmware_py.flaming_tool import FlamingTool
 from firmware_py.mission_controller import MissionController
 from firmware_py.node import Node
 from firmware_py.participant import BusFrame
+from firmware_py.path_driver import PathDriver
 from firmware_py.quantity import QuantityError, duration_ns
+from firmware_py.sprayer_boom import SprayerBoom
+from firmware_py.sprayer_mission import SprayerMission
+from firmware_py.ultrasonic_sensors import UltrasonicSensors
 
-PROGRAMS: Mapping[str, type[FlamingTool] | type[MissionController]] = {
+Program = (type[FlamingTool] | type[MissionController] | type[SprayerBoom] | type[SprayerMission] | type[PathDriver]
+           | type[AirblastSprayer] | type[AirblastMission] | type[UltrasonicSensors])
+PROGRAMS: Mapping[str, Program] = {
     "flaming_tool": FlamingTool,
     "mission_controller": MissionController,
+    "sprayer_boom": SprayerBoom,
+    "sprayer_mission": SprayerMission,
+    "path_driver": PathDriver,
+    "airblast_sprayer": AirblastSprayer,
+    "ultrasonic_sensors": UltrasonicSensors,
+    "airblast_mission": AirblastMission,
 }
 KEYS = ("title", "seed", "duration", "nodes", "orders", "faults")
 DEFAULT_DURATION_NS = 60_000_000_000
@@ -101,7 +115,7 @@ class Director:
             step = self._steps[self._next]
             self._next += 1
             node = self._nodes[step.node]
-            if step.order and isinstance(node, MissionController):
+            if step.order and isinstance(node, (MissionController, SprayerMission, AirblastMission)):
                 node.order(now_ns, step.statement)
             else:
                 node.inject(now_ns, step.statement)
@@ -125,10 +139,14 @@ class Cast:
         return (self.director, *self.nodes.values())
 
 
-def build(scenario: Scenario, *, seed: int | None = None, only: Collection[str] = ()) -> Cast:
-    """The nodes of a scenario, each with its own chance from the seed. only: build just these; unknown names are ignored."""
+def build(scenario: Scenario, *, seed: int | None = None, only: Collection[str] = (), codec: Codec | None = None) -> Cast:
+    """The nodes of a scenario, each with its own chance from the seed. only: build just these; unknown names are ignored.
+
+    codec: of all the files they need, when one is there already.
+    """
     chosen = [plan for plan in scenario.nodes if not only or plan.name in only]
-    codec = Codec.shipped(*dict.fromkeys(PROGRAMS[plan.program].DBC for plan in chosen))
+    programs = [PROGRAMS[plan.program] for plan in chosen]
+    codec = codec or Codec.shipped(*dict.fromkeys(name for program in programs for name in (program.DBC, *program.MORE_DBC)))
     nodes: dict[str, Node] = {}
     for plan in chosen:
         random = Random(f"{scenario.seed if seed is None else seed}/{plan.name}")
