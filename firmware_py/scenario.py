@@ -39,9 +39,12 @@ from firmware_py.quantity import QuantityError, duration_ns
 from firmware_py.sprayer_boom import SprayerBoom
 from firmware_py.sprayer_mission import SprayerMission
 from firmware_py.ultrasonic_sensors import UltrasonicSensors
+from firmware_py.vehicle import Vehicle
+from firmware_py.vehicle_mission import VehicleMission
 
 Program = (type[FlamingTool] | type[MissionController] | type[SprayerBoom] | type[SprayerMission] | type[PathDriver]
-           | type[AirblastSprayer] | type[AirblastMission] | type[UltrasonicSensors])
+           | type[AirblastSprayer] | type[AirblastMission] | type[UltrasonicSensors]
+           | type[Vehicle] | type[VehicleMission])
 PROGRAMS: Mapping[str, Program] = {
     "flaming_tool": FlamingTool,
     "mission_controller": MissionController,
@@ -51,6 +54,8 @@ PROGRAMS: Mapping[str, Program] = {
     "airblast_sprayer": AirblastSprayer,
     "ultrasonic_sensors": UltrasonicSensors,
     "airblast_mission": AirblastMission,
+    "vehicle": Vehicle,
+    "vehicle_mission": VehicleMission,
 }
 KEYS = ("title", "seed", "duration", "nodes", "orders", "faults")
 DEFAULT_DURATION_NS = 60_000_000_000
@@ -115,7 +120,7 @@ class Director:
             step = self._steps[self._next]
             self._next += 1
             node = self._nodes[step.node]
-            if step.order and isinstance(node, (MissionController, SprayerMission, AirblastMission)):
+            if step.order and isinstance(node, (MissionController, SprayerMission, AirblastMission, VehicleMission)):
                 node.order(now_ns, step.statement)
             else:
                 node.inject(now_ns, step.statement)

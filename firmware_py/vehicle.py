@@ -7,9 +7,9 @@ Theory of operation. Every tick of 50 ms: requests and watches → controller st
     any but Disabled ──Stop, stop switch──▶ Stopped ──Resume──▶ Ready          Executing ──10 s without movement──▶ Stopped
 
 It obeys Pause and Stop at once with its brakes. New movements of hitch, PTO and implement begin in Ready and Executing only,
-whatever comes over the bus: elsewhere somebody may be near. Stopped, Manual and Disabled switch PTO and implement off, an engine
-that stops ends the PTO, and they come back only when Off and Unset were commanded in between. Drivers are energised once a command: a part that did not obey
-tries again on Retry only.
+whatever comes over the bus: elsewhere somebody may be near. Stopped, Manual and Disabled switch PTO and implement off, an
+engine that stops ends the PTO, and they come back only when Off and Unset were commanded in between. Drivers are energised once
+a command: a part that did not obey tries again on Retry only.
 
 The engine, the speeds, the hitch, the PTO and the position are told as J1939 and ISO 11783 have them, too, each from the source
 address of the device that says it on a real tractor; and as NMEA 0183 to `nmea`, a serial line.
@@ -58,7 +58,7 @@ NO_VALUE = bytes([0xFF] * 8)
 LIMIT, REQUEST = "DriveSpeedLimit", "Request"
 MOVABLE = ("Ready", "Executing")
 HELD = ("Stopped", "Manual", "Disabled")
-REASONS = {"Command": "on command", "Switch": "by the stop switch", "CommandsLost": "without signs of life of the mission controller",
+REASONS = {"Command": "on command", "Switch": "by the stop switch", "CommandsLost": "without the mission controller's signs of life",
            "NotMoving": "because it does not move", "PositionLost": "without a position"}
 
 
@@ -403,7 +403,8 @@ class Vehicle(Node):
         active = self._unplugged
         return {"EngineProtectLamp": "Off", "EngineAmberLamp": "On" if active else "Off", "EngineRedLamp": "Off",
                 "EngineMalfunctionLamp": "Off", "EngineSpnLow": OIL_SPN if active else 0,
-                "EngineFmi": OPEN_CIRCUIT_FMI if active else 0, "EngineSpnHigh": 0, "EngineOccurrence": self._codes if active else 0}
+                "EngineFmi": OPEN_CIRCUIT_FMI if active else 0, "EngineSpnHigh": 0,
+                "EngineOccurrence": self._codes if active else 0}
 
     @property
     def _now_ns(self) -> int:
@@ -485,7 +486,7 @@ class Vehicle(Node):
         if turning[0] != turning[1]:
             self.tell(t_ns, "turns" if turning[1] else f"pass {self.drive.passage}")
         if pto[0] != pto[1]:
-            self.tell(t_ns, {"RunningUp": "PTO runs up", "On": "PTO on", "RunningDown": "PTO runs down"}.get(str(pto[1]), "PTO off"))
+            self.tell(t_ns, f"PTO {_PTO_WORDS[str(pto[1])]}")
         if implement[0] != implement[1]:
             self.tell(t_ns, f"implement {str(implement[1]).lower()}")
         if hitch[0] != hitch[1]:
@@ -494,5 +495,6 @@ class Vehicle(Node):
             self.tell(t_ns, "engine runs" if engine[1] else "engine off")
 
 
+_PTO_WORDS = {"RunningUp": "runs up", "On": "on", "RunningDown": "runs down", "Off": "off"}
 _POSITION_ID = 514
 _VP_PGN, _EFL_PGN = 65267, 65263

@@ -1,4 +1,4 @@
-"""The mission controller of the vehicle: the other program of the UCS, which starts its missions and commands hitch, PTO, implement.
+"""The mission controller of the vehicle: the other program of the UCS, which starts missions, commands hitch, PTO and implement.
 
 Theory of operation. It is told what to do (`mission start`, `pto on`, `hitch by path`). VEHICLE_GUIDE is its sign of life: it
 stops when the vehicle has been silent for 1 s, so that nothing drives unseen. VEHICLE_CMD is sent once for each order, with the

@@ -1,0 +1,274 @@
+"""The vehicle under level 1, in virtual time: a healthy mission raises nothing, each fault its alarm; orders reach the brakes."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from decimal import Decimal
+
+import pytest
+
+from firmware_py.drive import KMH
+from firmware_py.scenario import build, parse
+from firmware_py.vehicle import Vehicle
+from firmware_py.virtual_bus import Simulation
+from level1.catalog import Catalog
+from level1.command import Order
+from level1.event import Event, Output, Result
+from level1.io import definitions
+from level1.supervisor import Supervisor
+from ucs.simulate import SHIPPED, load
+from ucs.simulated_unit import SimulatedUnit
+
+SECOND = 1_000_000_000
+FILES = ("vehicle.dbc", "isobus_tractor.dbc", "ucs.dbc")
+NODES = '[nodes.tractor]\nprogram = "vehicle"\n{}\n[nodes.mission]\nprogram = "vehicle_mission"\n'
+WORK = ("at 1 s: mission start", "at 1 s: pto on", "at 1 s: hitch by path", "at 1 s: implement set")
+
+
+@pytest.fixture(scope="module")
+def catalog() -> Catalog:
+    return definitions.load(FILES)
+
+
+class Farm:
+    """Tractor, mission controller and level 1. events: what level 1 reported; results: of orders."""
+
+    def __init__(self, catalog: Catalog, text: str, armed: Sequence[str] | None = None):
+        self.scenario = parse(text, "test.toml")
+        cast = build(self.scenario)
+        self.events: list[Event] = []
+        self.results: list[Result] = []
+        self.told: list[str] = []
+        self.supervisor = Supervisor(catalog, unit="tractor-7", start_ns=0, armed=armed)
+        self.unit = SimulatedUnit(self.supervisor, self._deliver)
+        self.simulation = Simulation([*cast.participants, self.unit], on_happening=lambda said: self.told.append(said.text))
+        tractor = cast.nodes["tractor"]
+        assert isinstance(tractor, Vehicle)
+        self.tractor = tractor
+
+    def _deliver(self, outputs: Sequence[Output]) -> None:
+        self.events += [output for output in outputs if isinstance(output, Event)]
+        self.results += [output for output in outputs if isinstance(output, Result)]
+
+    def run(self, until_s: float | None = None) -> Farm:
+        """Up to a time, or to the scenario's end."""
+        self.simulation.run(self.scenario.duration_ns if until_s is None else round(until_s * SECOND))
+        return self
+
+    def order(self, name: str, target: str = "", value: str | None = None, origin: str = "above") -> str:
+        """An order; gives why it was refused, or nothing."""
+        number = Decimal(value) if value is not None else None
+        order = Order("1", name, target, number, origin="local" if origin == "local" else "above")
+        self.unit._take(self.supervisor.command(order, self.simulation.now_ns))
+        return self.results[-1].reason
+
+    def life(self, alarm: str) -> list[str]:
+        """What was reported of an alarm."""
+        return [event.event for event in self.events if event.alarm == alarm]
+
+    @property
+    def raised(self) -> set[str]:
+        """Alarms that were raised at all."""
+        return {event.alarm for event in self.events if event.event == "raised"}
+
+    @property
+    def kmh(self) -> float:
+        """How fast it drives."""
+        return self.tractor.drive.speed_m_s * KMH
+
+
+def farm(catalog: Catalog, *faults: str, orders: Sequence[str] = WORK, duration: str = "2 min", settings: str = "",
+         armed: Sequence[str] | None = None) -> Farm:
+    """A mission with faults. settings: further lines of the tractor's table."""
+    head = f'duration = "{duration}"\norders = {list(orders)}\nfaults = {list(faults)}\n'
+    return Farm(catalog, head + NODES.format(settings), armed)
+
+
+# --- missions -----------------------------------------------------------------------------------------------------------------
+
+
+def test_a_healthy_mission_raises_nothing_but_that_it_is_finished(catalog: Catalog) -> None:
+    done = farm(catalog, duration="10 min", orders=(*WORK, "at 9 min: pto off", "at 9 min: implement unset")).run()
+    assert [(event.alarm, event.event) for event in done.events] == [("MissionFinished", "raised")]
+    assert done.tractor.drive.passage == 7
+    assert done.tractor.controller == "Ready"
+
+
+@pytest.mark.parametrize("name", sorted(file.name for file in SHIPPED.glob("vehicle_*.toml")))
+def test_each_shipped_scenario_of_the_vehicle_runs(catalog: Catalog, name: str) -> None:
+    assert load(name).title
+    shown = Farm(catalog, (SHIPPED / name).read_text("utf-8")).run()
+    assert "executing" in shown.told
+
+
+# --- each fault, its alarm, its repair, its end -------------------------------------------------------------------------------
+
+REPAIRED = ["raised", "repair_started", "repaired", "cleared"]
+LOCKED = ["raised", *["repair_started", "repair_failed"] * 2, "locked_out"]
+TABLE = [
+    ("UnitNotMoving", ["at 20 s: tractor.engine dies"], ["raised"], {"UnitNotMoving"}),
+    ("UnitNotMoving", ["at 20 s: tractor.wheels blocked for 8 s"], ["raised", "cleared"], {"UnitNotMoving"}),
+    ("UnitNotMoving", ["at 20 s: tractor.wheels blocked"], ["raised"], {"UnitNotMoving"}),
+    ("UnitStopped", ["at 20 s: tractor.stop_switch pressed for 5 s"], ["raised"], {"UnitStopped"}),
+    ("HitchNotMoving", ["at 0 s: tractor.hitch stuck for 1 command"], REPAIRED, {"HitchNotMoving"}),
+    ("HitchNotMoving", ["at 0 s: tractor.hitch stuck for 2 commands"],
+     ["raised", "repair_started", "repair_failed", "repair_started", "repaired", "cleared"], {"HitchNotMoving"}),
+    ("HitchNotMoving", ["at 0 s: tractor.hitch stuck"], LOCKED, {"HitchNotMoving"}),
+    ("PtoNotSet", ["at 0 s: tractor.pto refuses for 1 command"], REPAIRED, {"PtoNotSet", "RearPtoNotEngaging"}),
+    ("PtoNotSet", ["at 0 s: tractor.pto refuses"], LOCKED, {"PtoNotSet", "RearPtoNotEngaging"}),
+    ("PtoNotUnset", ["at 50 s: tractor.pto stays on for 2 commands"],
+     ["raised", "repair_started", "repair_failed", "repair_started", "repaired", "cleared"], {"PtoNotUnset"}),
+    ("PtoNotUnset", ["at 50 s: tractor.pto stays on"],
+     ["raised", *["repair_started", "repair_failed"] * 3, "locked_out"], {"PtoNotUnset"}),
+    ("ImplementSetUnsetFailure", ["at 0 s: tractor.implement refuses for 1 command"], REPAIRED, {"ImplementSetUnsetFailure"}),
+    ("ImplementSetUnsetFailure", ["at 50 s: tractor.implement refuses for 1 command"], REPAIRED, {"ImplementSetUnsetFailure"}),
+    ("ImplementSetUnsetFailure", ["at 0 s: tractor.implement refuses"],
+     ["raised", *["repair_started", "repair_failed"] * 3, "locked_out"], {"ImplementSetUnsetFailure"}),
+    ("VehicleSilent", ["at 20 s: tractor silent for 5 s"], ["raised", "cleared"], None),
+    ("VehicleFrozen", ["at 20 s: tractor frozen for 5 s"], ["raised", "cleared"], {"VehicleFrozen", "VehicleCommandsLost"}),
+    ("VehicleCommandsLost", ["at 20 s: mission silent for 3 s"], ["raised"], {"VehicleCommandsLost"}),
+    ("PositionLost", ["at 20 s: tractor.gnss lost for 10 s"], ["raised", "cleared"], {"PositionLost"}),
+    ("PositionInaccurate", ["at 20 s: tractor.gnss float for 20 s"], ["raised", "cleared"], {"PositionInaccurate"}),
+    ("OilPressureSensorFault", ["at 20 s: tractor.oil_sensor unplugged for 20 s"], ["raised", "cleared"],
+     {"OilPressureSensorFault", "EngineWarningLamp", "TroubleCode"}),
+    ("CoolantHot", ["at 5 s: tractor.coolant leaks for 90 s"], ["raised", "cleared"], {"CoolantHot", "CoolantCritical"}),
+    ("ChargingVoltageLow", ["at 20 s: tractor.alternator dead for 40 s"], ["raised", "cleared"], {"ChargingVoltageLow"}),
+]
+
+
+@pytest.mark.parametrize(("alarm", "faults", "life", "others"), TABLE, ids=lambda value: str(value)[:60])
+def test_each_fault_raises_its_alarm_and_no_other(catalog: Catalog, alarm: str, faults: list[str], life: list[str],
+                                                  others: set[str] | None) -> None:
+    orders = (*WORK, "at 51 s: pto off", "at 51 s: implement unset")
+    seen = farm(catalog, *faults, orders=orders, duration="4 min" if "Coolant" in alarm else "2 min").run()
+    assert seen.life(alarm) == life
+    if others is not None:
+        assert seen.raised - {"MissionFinished"} == others
+
+
+def test_every_alarm_of_the_definition_is_raised_by_some_fault() -> None:
+    assert set(definitions.load(["vehicle.dbc"]).alarms) <= {alarm for alarm, *_ in TABLE} | {"MissionFinished"}
+
+
+@pytest.mark.parametrize("fault", [
+    "at 20 s: tractor silent for 600 ms", "at 20 s: mission silent for 300 ms", "at 20 s: tractor.gnss lost for 300 ms",
+    "at 20 s: tractor.wheels blocked for 2 s", "at 20 s: tractor.gnss float for 3 s"])
+def test_what_is_within_the_allowances_raises_nothing(catalog: Catalog, fault: str) -> None:
+    assert farm(catalog, fault, duration="1 min").run().events == []
+
+
+def test_a_reset_of_the_vehicles_computer_brakes_and_switches_off(catalog: Catalog) -> None:
+    reset = farm(catalog, "at 20 s: tractor reset").run(26)
+    assert reset.kmh == 0
+    assert reset.tractor.controller == "Ready"
+    assert reset.tractor.pto.state in ("Off", "RunningDown")
+    assert reset.raised <= {"VehicleSilent"}
+
+
+# --- the interlock: nothing moves while somebody may be near ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("who", ["at 9 s: tractor manual", "at 9 s: tractor.stop_switch pressed"])
+@pytest.mark.parametrize("fault", ["pto refuses", "implement refuses", "hitch stuck"])
+def test_no_repair_moves_anything_while_somebody_may_be_near(catalog: Catalog, who: str, fault: str) -> None:
+    near = farm(catalog, f"at 0 s: tractor.{fault} for 9 s", who, duration="1 min").run(9.2)
+    position = near.tractor.hitch.position
+    near.run()
+    assert near.tractor.pto.clutch.position == "Off"
+    assert near.tractor.implement.position == "Unset"
+    assert near.tractor.hitch.position == position
+    assert "repaired" not in {event.event for event in near.events}
+
+
+@pytest.mark.parametrize("order", ["pause", "stop"])
+def test_no_repair_begins_while_the_unit_is_paused_or_stopped_from_above(catalog: Catalog, order: str) -> None:
+    held = farm(catalog, "at 0 s: tractor.pto refuses").run(5)
+    assert held.order(order) == ""
+    held.run()
+    assert "repair_started" not in held.life("PtoNotSet")
+    assert held.tractor.pto.clutch.position == "Off"
+
+
+def test_a_pto_that_does_not_let_go_is_switched_off_again_even_when_stopped(catalog: Catalog) -> None:
+    runs = farm(catalog, "at 10 s: tractor.pto stays on for 2 commands").run(20)
+    assert runs.order("stop") == ""
+    assert runs.run().life("PtoNotUnset")[-1] == "cleared"
+    assert runs.tractor.pto.state == "Off"
+
+
+def test_after_a_stop_pto_and_implement_stay_off_until_ordered_anew(catalog: Catalog) -> None:
+    stopped = farm(catalog, orders=(*WORK, "at 40 s: mission start", "at 60 s: pto on")).run(20)
+    stopped.order("stop")
+    stopped.run(30)
+    assert stopped.order("resume", origin="local") == ""
+    stopped.run(55)
+    assert stopped.tractor.controller == "Executing"
+    assert stopped.tractor.pto.state == "Off"
+    assert stopped.tractor.implement.position == "Unset"
+    assert stopped.run(70).tractor.pto.state == "On"
+
+
+def test_a_lock_out_pauses_the_mission_and_can_be_reset(catalog: Catalog) -> None:
+    orders = (*WORK, "at 90 s: mission resume", "at 95 s: pto on")
+    locked = farm(catalog, "at 0 s: tractor.pto refuses for 60 s", orders=orders).run(70)
+    assert locked.life("PtoNotSet")[-1] == "locked_out"
+    assert locked.tractor.controller == "Paused"
+    locked.order("reset", "PtoNotSet", origin="local")
+    locked.run()
+    assert locked.life("PtoNotSet")[-1] == "cleared"
+    assert locked.tractor.pto.state == "On"
+
+
+# --- orders from above --------------------------------------------------------------------------------------------------------
+
+
+def test_pause_and_resume_brake_and_go_on(catalog: Catalog) -> None:
+    unit = farm(catalog).run(20)
+    assert unit.kmh == pytest.approx(3)
+    before_m = unit.tractor.drive.driven_m
+    assert unit.order("pause") == ""
+    unit.run(20.5)
+    assert 0 < unit.kmh < 3, "it brakes, it does not jump"
+    unit.run(22)
+    assert unit.kmh == 0
+    assert 0.3 < unit.tractor.drive.driven_m - before_m < 0.7
+    assert unit.tractor.pto.state == "On"
+    assert unit.order("resume") == ""
+    assert unit.run(30).kmh == pytest.approx(3)
+    assert unit.raised == set()
+
+
+def test_stop_brakes_harder_and_is_released_at_the_machine_only(catalog: Catalog) -> None:
+    unit = farm(catalog, orders=(*WORK, "at 40 s: mission start")).run(20)
+    before_m = unit.tractor.drive.driven_m
+    assert unit.order("stop") == ""
+    unit.run(30)
+    assert unit.tractor.drive.driven_m - before_m < 0.3
+    assert unit.tractor.pto.state == "Off"
+    assert unit.life("UnitStopped") == ["raised"]
+    assert "at the machine" in unit.order("resume")
+    assert unit.order("stop") == "", "a stop may be repeated"
+    assert unit.order("resume", origin="local") == ""
+    unit.run(50)
+    assert unit.kmh == pytest.approx(3)
+    assert unit.life("UnitStopped") == ["raised", "cleared"]
+
+
+def test_reduced_speed_holds_through_a_pause_and_does_not_resume(catalog: Catalog) -> None:
+    unit = farm(catalog).run(20)
+    assert unit.order("reduce_speed", value="1.5") == ""
+    assert unit.run(25).kmh == pytest.approx(1.5)
+    unit.order("pause")
+    unit.run(30)
+    assert unit.order("reduce_speed", value="1") == ""
+    assert unit.run(35).kmh == 0
+    unit.order("resume")
+    assert unit.run(40).kmh == pytest.approx(1)
+    assert "outside" in unit.order("reduce_speed", value="7")
+
+
+@pytest.mark.parametrize("order", ["pause", "stop"])
+def test_stop_and_pause_go_through_in_the_middle_of_every_repair(catalog: Catalog, order: str) -> None:
+    busy = farm(catalog, "at 0 s: tractor.pto refuses", "at 0 s: tractor.hitch stuck", "at 0 s: tractor.implement refuses").run(8)
+    assert "repair_started" in {event.event for event in busy.events}
+    assert busy.order(order) == ""
+    assert busy.run(12).kmh == 0
