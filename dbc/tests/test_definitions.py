@@ -175,8 +175,7 @@ def health_events(seconds: int, raws: Mapping[str, int]) -> list[str]:
     ({"TimeSync": 0}, ["TimeSyncLost 120"]),
     ({"JournalState": 2}, ["JournalFault 2"]),
     ({"LoopLateness": 51}, ["LoopLate 5"]),
-    ({"BusState": 3}, ["CanBusDown 1"]),
-    ({"BusState": 4}, ["CanBusDown 1"]),
+    ({"BusState": 4}, []),  # reported by who looks after the bus
     ({"BusLoad": 201}, ["BusOverloaded 10"]),
     ({"CpuTemperature": 0xFF, "MainboardTemperature": 0xFF, "TimeSync": 3, "BusState": 15, "GnssQuality": 7}, []),
 ])

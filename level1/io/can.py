@@ -1,92 +1,112 @@
-"""A CAN bus, live: frames into the inbox, frames out within their time, found again when it was lost.
+"""A CAN bus, live: frames in, frames out within their time, found again when it was lost, its health reported.
 
-Theory of operation. Each bus has one reader thread, which alone opens and closes the interface. It waits at most `POLL_S`
-for a frame; whatever goes wrong (link down, adapter pulled out, a library's exception) it reports, closes, and opens again
-every `RETRY_S` until frames can come. A socket whose interface went away stays deaf for ever, therefore always anew.
+Theory of operation. Each bus has one thread, which alone opens and closes the interface. Whatever goes wrong (link down,
+adapter pulled out, a library's exception) it reports, closes, and opens again every `RETRY_S` until the interface is there.
+A socket whose interface went away stays deaf for ever, therefore always anew.
+
+Where the interface has a descriptor (SocketCAN) the loop's thread reads the frames itself (`fetch`): no frame changes threads.
+Only when the loop is late, because the disk is, the bus's thread fetches them into the inbox, so that the kernel's buffer, small
+where it may not be enlarged, does not run over. Other interfaces are read by the bus's thread, frame by frame.
 
 Frames go out from the loop's thread, which never waits: what the interface can't take now is tried again every
-`RETRY_SEND_NS`, and is dropped and counted once it is past its time.
-
-python-can's stamps are of the wall clock, which jumps on a tractor. A frame's age by them is believed when it is plausible
-and the wall clock ran evenly, and is taken off the monotonic clock; else the frame counts from when it was read.
+`RETRY_SEND_NS`, and is dropped, counted and reported once it is past its time.
 """
 from __future__ import annotations
 
 import contextlib
-import errno
-import fcntl
-import logging
-import socket
-import struct
+import os
 import threading
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
-import can
-from can.interfaces import VALID_INTERFACES
-
+from level1.bus_health import BITS_A_FRAME, WINDOW_NS, BusHealth, Report, Traffic
 from level1.event import Send
-from level1.frame import BUS_SHIFT, EXTENDED, Frame
+from level1.frame import Frame
 from level1.io.config import Bus
-from level1.io.error import OutsideError, did_you_mean
 from level1.io.inbox import Inbox
-from level1.io.message import CLASSIC_BYTES, from_message
+from level1.io.listening import Listening
+from level1.io.socketcan import BusError, Filter, SocketCan
 
-POLL_S = 0.2
+__all__ = ["BusError", "Interface", "Port", "open_bus"]
+
+TICK_S = 0.05
+"""So often a bus's thread looks after its interface."""
+LATE_NS = 40_000_000
+"""A loop that has not fetched for so long is late."""
 RETRY_S = 0.25
 RETRY_SEND_NS = 1_000_000
 WAITING_SENDS = 200
 """Frames that wait for an interface at most; the oldest is dropped first."""
-PLAUSIBLE_AGE_NS = 1_000_000_000
-"""A frame that waited longer in the kernel's buffer (278 frames by default) than this can't be."""
-EVEN_NS = 1_000_000
-"""How exactly the two clocks are compared; moving apart by twice this between two frames is a jump (NTP slews 0.5 ms/s)."""
-_SIOCGIFFLAGS, _IFF_UP = 0x8913, 1
-
-# python-can tells the terminal what it also raises.
-logging.getLogger("can").addHandler(logging.NullHandler())
+MOST_IDS = 4096
+"""Identifiers counted in a window."""
 
 
-class BusError(OutsideError):
-    """A bus that can't be opened; the text says what to do."""
+class Interface(Protocol):
+    """An open interface: `SocketCan` or `python_can.PythonCan`. Raises OSError, or what its driver raises, when it is lost.
+
+    impossible: frames that can't be, so far.
+    """
+
+    impossible: int
+
+    @property
+    def lost(self) -> int:
+        """Frames dropped on the way to here since it was opened."""
+
+    @property
+    def last_ns(self) -> int | None:
+        """When the last frame came."""
+
+    def fileno(self) -> int | None:
+        """The descriptor that becomes readable; None: `receive` waits by itself."""
+
+    def receive(self, bus: int) -> list[Frame]:
+        """The frames that have come."""
+
+    def errors(self, bus: int) -> list[Frame]:
+        """The error message frames that have come."""
+
+    def listen(self, filters: Sequence[Filter] | None) -> None:
+        """Receive only what passes one of the filters, None: everything."""
+
+    def send(self, key: int, data: bytes) -> bool:
+        """Send a frame; False: not now."""
+
+    def traffic(self) -> tuple[int, int] | None:
+        """Frames and bytes on the interface so far, whoever asked for them; None: not counted."""
+
+    def close(self) -> None:
+        """Close it."""
 
 
-class Stamps:
-    """Turns wall-clock stamps into times of the monotonic clock."""
-
-    def __init__(self) -> None:
-        self._offset_ns: int | None = None
-        self._even_since_ns = 0
-
-    def monotonic_ns(self, stamp_ns: int, before_ns: int, wall_ns: int, now_ns: int) -> int:
-        """When a frame came, by its stamp. The wall clock showed `wall_ns` between `before_ns` and `now_ns`."""
-        offset = wall_ns - now_ns
-        if now_ns - before_ns <= EVEN_NS:  # else the thread was interrupted between its looks at the clocks
-            if self._offset_ns is not None and abs(offset - self._offset_ns) > 2 * EVEN_NS:
-                # What was stamped before a jump may still be on its way.
-                self._even_since_ns = now_ns + PLAUSIBLE_AGE_NS
-            self._offset_ns = offset
-        age = wall_ns - stamp_ns
-        return now_ns - age if 0 <= age < PLAUSIBLE_AGE_NS and now_ns >= self._even_since_ns else now_ns
+Opener = Callable[[Bus, Callable[[], int], Callable[[], int]], Interface]
 
 
 class Port:
-    """One bus. counters: frames sent, expired, dropped and failed; times lost; frames that can't be.
+    """One bus. counters: frames sent, expired, dropped and failed; times lost; frames lost on the way in.
 
     clock, wall: monotonic and wall clock in ns. opener: opens the interface (default: `open_bus`).
     """
 
     def __init__(self, index: int, settings: Bus, inbox: Inbox, clock: Callable[[], int], wall: Callable[[], int],
-                 opener: Callable[[Bus], can.BusABC] | None = None):
+                 opener: Opener | None = None):
         self.index, self.settings = index, settings
         self.counters: Counter[str] = Counter()
+        self.health = BusHealth(settings.name, settings.channel, settings.bitrate)
+        self.load_percent: float | None = None
         self._inbox, self._clock, self._wall = inbox, clock, wall
         self._opener = opener or open_bus
-        self._bus: can.BusABC | None = None
+        self._wire: Interface | None = None
+        self._lock = threading.Lock()
         self._waiting: deque[Send] = deque()
+        self._unsent: Counter[str] = Counter()
         self._stopping = threading.Event()
         self._suspect = ""
         self._lost_ns: int | None = None
+        self._fetched_ns = 0
+        self._listening: Listening | None = None
+        self._window = _Window(clock())
         self._thread = threading.Thread(target=self._run, name=f"bus {settings.name}", daemon=True)
 
     @property
@@ -94,9 +114,14 @@ class Port:
         """Whether the interface is gone at the moment."""
         return self._lost_ns is not None
 
+    @property
+    def state(self) -> str:
+        """A word of `health.BUS_STATES`."""
+        return self.health.state
+
     def start(self) -> None:
         """Open the interface and begin to read. Raises BusError."""
-        self._bus = self._opener(self.settings)
+        self._open()
         self._thread.start()
 
     def stop(self) -> None:
@@ -105,13 +130,19 @@ class Port:
         if self._thread.ident is not None:
             self._thread.join()
 
+    def listen(self, listening: Listening) -> None:
+        """From now on receive only this; as long as nobody says so, everything is received."""
+        with self._lock:
+            self._listening = listening
+            self.health.cycle_of = listening.cycle_of
+            self._apply(self._window.wide)
+
     # --- out: the loop's thread ---------------------------------------------------------------------------------------
 
     def send(self, frame: Send, now_ns: int) -> None:
         """Send a frame, at the latest until it expires."""
         if len(self._waiting) >= WAITING_SENDS:
-            self._waiting.popleft()
-            self.counters["dropped"] += 1
+            self._give_up(self._waiting.popleft(), "dropped")
         self._waiting.append(frame)
         self.flush(now_ns)
 
@@ -120,7 +151,7 @@ class Port:
         while self._waiting:
             frame = self._waiting[0]
             if now_ns > frame.expires_ns:
-                self.counters["expired"] += 1
+                self._give_up(frame, "expired")
             elif not self._try(frame):
                 return now_ns + RETRY_SEND_NS
             self._waiting.popleft()
@@ -128,127 +159,218 @@ class Port:
 
     def _try(self, frame: Send) -> bool:
         """Send a frame now; False: not now."""
-        bus = self._bus
-        if bus is None:
-            return False
-        message = can.Message(arbitration_id=frame.key & 0x1FFFFFFF, is_extended_id=bool(frame.key & EXTENDED),
-                              data=frame.data, is_fd=len(frame.data) > CLASSIC_BYTES)
-        try:
-            bus.send(message, timeout=0)
-        except (can.CanError, OSError, ValueError) as error:
-            if _is_full(error):
+        with self._lock:
+            wire = self._wire
+            if wire is None:
                 return False
-            # The error of a lost interface comes once, here or there; the reader must not miss it.
-            self._suspect = f"can't send: {_reason(error)}"
-            self.counters["failed"] += 1
-            return True
+            try:
+                if not wire.send(frame.key, frame.data):
+                    return False
+            except OSError as error:
+                # The error of a lost interface comes once, here or there; the bus's thread must not miss it.
+                self._suspect = f"can't send: {reason(error)}"
+                self._give_up(frame, "failed")
+                return True
         self.counters["sent"] += 1
         return True
 
-    # --- in: the reader's thread --------------------------------------------------------------------------------------
+    def _give_up(self, frame: Send, word: str) -> None:
+        self.counters[word] += 1
+        self._unsent[frame.message] += 1
+
+    # --- in: the loop's thread ----------------------------------------------------------------------------------------
+
+    def fetch(self) -> list[Frame]:
+        """The frames that have come, of an interface with a descriptor; those of others are in the inbox."""
+        self._fetched_ns = self._clock()
+        return self._read()
+
+    def _read(self) -> list[Frame]:
+        with self._lock:
+            wire = self._wire
+            if wire is None or wire.fileno() is None:
+                return []
+            try:
+                frames = wire.receive(self.index)
+            except OSError as error:
+                self._suspect = reason(error)
+                return []
+            self._window.count(frames)
+            return frames
+
+    # --- the bus's thread ---------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        stamps = Stamps()
         while not self._stopping.is_set():
             try:
-                self._poll(stamps)
-            except Exception as error:  # whatever a driver raises: a reader that ended would be a silent bus
+                self._tend()
+            except Exception as error:  # whatever a driver raises: a thread that ended would be a silent bus
                 self._lose(error)
+                self._judge()
                 self._stopping.wait(RETRY_S)
         self._close()
 
-    def _poll(self, stamps: Stamps) -> None:
-        """Wait for one frame. Raises what a lost interface makes the driver raise."""
-        if self._bus is None:
-            self._bus = self._opener(self.settings)
-            self._suspect = ""
-        message = self._bus.recv(POLL_S)
+    def _tend(self) -> None:
+        """Look after the interface for a moment. Raises what a lost interface makes the driver raise."""
+        if self._wire is None:
+            self._open()
+        wire = self._wire
+        assert wire is not None
+        if wire.fileno() is None:
+            frames = wire.receive(self.index)
+            self._window.count(frames)
+        else:
+            self._stopping.wait(TICK_S)
+            late = self._clock() - self._fetched_ns > LATE_NS
+            frames = self._read() if late else []
+        if frames:
+            self._inbox.put(frames)
         if self._suspect:
             raise BusError(self._suspect)
         if self._lost_ns is not None:
             self._find()
-        if message is None:
+        self._hear_errors(wire)
+        self._judge()
+
+    def _hear_errors(self, wire: Interface) -> None:
+        errors = wire.errors(self.index)
+        reports = [report for frame in errors for report in self.health.error(frame.t_ns, frame.key & 0x1FFF_FFFF, frame.data)]
+        if wire.last_ns is not None:
+            reports += self.health.heard(wire.last_ns)
+        if errors:
+            self.counters["error frames"] += len(errors)
+            self._inbox.put(errors)
+        self._report(reports)
+
+    def _judge(self) -> None:
+        """Once a window is over: what was counted in it."""
+        now_ns = self._clock()
+        if now_ns < self._window.begin_ns + WINDOW_NS:
             return
-        try:
-            key, data = from_message(message)
-        except ValueError:
-            self.counters["impossible"] += 1
+        wire = self._wire
+        with self._lock:
+            window, self._window = self._window, _Window(now_ns, self._window)
+            lost = self._window.lost_until(wire.lost if wire is not None else None)
+            unsent, self._unsent = self._unsent, Counter()
+        traffic = wire.traffic() if wire is not None else None
+        if lost:
+            self.counters["lost on the way in"] += lost
+        sent = self.counters["sent"] - window.sent
+        self._window.sent = self.counters["sent"]
+        if wire is not None and wire.impossible:
+            self.counters["impossible"] += wire.impossible
+            wire.impossible = 0
+        self._report(self.health.window(now_ns, Traffic(window.ids, window.span_ns(now_ns), lost, unsent, sent)))
+        self._widen(window, traffic)
+
+    def _widen(self, window: _Window, traffic: tuple[int, int] | None) -> None:
+        """Where far more comes than was asked for, ask for everything, to find out which identifier babbles."""
+        now = self._window
+        now.traffic = traffic
+        if traffic is None or window.traffic is None:
             return
-        t_ns = stamps.monotonic_ns(int(message.timestamp * 1e9), self._clock(), self._wall(), self._clock())
-        self._inbox.put(Frame(t_ns, key | self.index << BUS_SHIFT, data))
+        frames, octets = traffic[0] - window.traffic[0], traffic[1] - window.traffic[1]
+        seconds = (now.begin_ns - window.begin_ns) / 1e9
+        if self.settings.bitrate:
+            self.load_percent = min(100.0, 100 * (frames * (BITS_A_FRAME - 64) + 8 * octets) / seconds / self.settings.bitrate)
+        much = self.health.most_a_second * seconds
+        now.wide = frames > much + window.seen if not window.wide else self.health.babbles or frames > much
+        if now.wide != window.wide:
+            with self._lock:
+                self._apply(now.wide)
+
+    def _apply(self, wide: bool) -> None:
+        """Set the filters. To be called with the lock."""
+        if self._wire is not None and self._listening is not None:
+            self._wire.listen(None if wide else self._listening.filters)
+
+    def _open(self) -> None:
+        wire = self._opener(self.settings, self._clock, self._wall)
+        with self._lock:
+            self._suspect = ""
+            self._wire = wire
+            self._window = _Window(self._clock())
+            self._window.sent = self.counters["sent"]
+            self._apply(False)
+        descriptor = wire.fileno()
+        if descriptor is not None:
+            self._inbox.watch(descriptor)
 
     def _lose(self, error: Exception) -> None:
         self._close()
         if self._lost_ns is None:
             self._lost_ns = self._clock()
             self.counters["lost"] += 1
-            self._inbox.notice(f"bus {self.settings.name}: lost ({_reason(error)}); trying again")
+            self._report(self.health.down(self._lost_ns, reason(error)))
+            self._inbox.notice(f"bus {self.settings.name}: lost ({reason(error)}); trying again")
 
     def _find(self) -> None:
         now_ns = self._clock()
         away_s = (now_ns - (self._lost_ns or now_ns)) / 1e9
         self._lost_ns = None
+        self._report(self.health.up(now_ns))
         self._inbox.notice(f"bus {self.settings.name}: back after {away_s:.1f} s")
 
     def _close(self) -> None:
-        bus, self._bus = self._bus, None
-        if bus is not None:
+        with self._lock:
+            wire, self._wire = self._wire, None
+            if wire is None:
+                return
+            descriptor = wire.fileno()
+            if descriptor is not None:
+                self._inbox.forget(descriptor)
             with contextlib.suppress(Exception):  # a lost adapter's driver may fail at closing too
-                bus.shutdown()
+                wire.close()
+
+    def _report(self, reports: list[Report]) -> None:
+        if reports:
+            self._inbox.report(reports)
 
 
-def open_bus(settings: Bus) -> can.BusABC:
-    """Open an interface. Raises BusError with what to do."""
-    if settings.interface not in VALID_INTERFACES:
-        raise BusError(f'bus {settings.name}: no interface is called "{settings.interface}"'
-                       f"{did_you_mean(settings.interface, VALID_INTERFACES)}")
+class _Window:
+    """What is counted between two judgements. before: the window before it."""
+
+    def __init__(self, now_ns: int, before: _Window | None = None):
+        self.begin_ns = now_ns
+        self.oldest_ns = self.newest_ns = now_ns
+        self.ids: Counter[int] = Counter()
+        self.seen = 0
+        self.sent = 0
+        self.traffic: tuple[int, int] | None = None
+        self.wide: bool = before is not None and before.wide
+        self._lost: int = before._lost if before is not None else 0
+
+    def count(self, frames: Sequence[Frame]) -> None:
+        """Frames have come."""
+        if not frames:
+            return
+        self.oldest_ns, self.newest_ns = min(self.oldest_ns, frames[0][0]), max(self.newest_ns, frames[-1][0])
+        self.seen += len(frames)
+        if len(self.ids) < MOST_IDS:
+            self.ids.update([frame[1] & 0xFFFF_FFFF for frame in frames])
+
+    def span_ns(self, now_ns: int) -> int:
+        """Time over which its frames came: of old ones that had to wait, longer than the window."""
+        return max(now_ns - self.begin_ns, self.newest_ns - self.oldest_ns)
+
+    def lost_until(self, lost: int | None) -> int:
+        """Frames lost in this window, by the interface's count of all."""
+        if lost is None:
+            return 0
+        new, self._lost = lost - self._lost, lost
+        return new
+
+
+def open_bus(settings: Bus, clock: Callable[[], int], wall: Callable[[], int]) -> Interface:
+    """Open an interface: SocketCAN directly, every other one by python-can. Raises BusError with what to do."""
     if settings.interface == "socketcan":
-        _check_socketcan(settings)
-    options = dict(settings.options)
-    if settings.bitrate is not None:
-        options["bitrate"] = settings.bitrate
-    if settings.fd:
-        options["fd"] = True
-    try:
-        return can.Bus(channel=settings.channel, interface=settings.interface, ignore_config=True, **options)
-    except (can.CanError, OSError, ImportError, NotImplementedError, TypeError, ValueError) as error:
-        raise BusError(f"bus {settings.name}: {settings.interface} {settings.channel} can't be opened: {_reason(error)}; "
-                       "check the adapter, its driver and the [[bus]] table") from None
+        return SocketCan(settings, clock, wall)
+    from level1.io.python_can import open_interface  # only where one is used: it costs 15 MB
+    return open_interface(settings, clock, wall)
 
 
-def _check_socketcan(settings: Bus) -> None:
-    """Say what to do where the interface is missing or down."""
-    name, channel = settings.name, settings.channel
-    try:
-        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
-            request = fcntl.ioctl(probe, _SIOCGIFFLAGS, struct.pack("16sh14x", channel.encode(), 0))
-    except OSError as error:
-        if error.errno != errno.ENODEV:
-            raise BusError(f"bus {name}: this kernel has no SocketCAN ({error.strerror}); load it: modprobe can-raw") from None
-        raise BusError(f"bus {name}: there is no interface {channel}; {_create(settings)}") from None
-    if not struct.unpack("16sh14x", request)[1] & _IFF_UP:
-        raise BusError(f"bus {name}: the interface {channel} is down; {_bring_up(settings)}")
-
-
-def _create(settings: Bus) -> str:
-    if settings.channel.startswith("vcan"):
-        return f"create it: ip link add {settings.channel} type vcan && {_bring_up(settings).partition(': ')[2]}"
-    return f"plug the adapter in (`ip link` lists what is there), then {_bring_up(settings)}"
-
-
-def _bring_up(settings: Bus) -> str:
-    rate = "" if settings.channel.startswith("vcan") else f" type can bitrate {settings.bitrate or 250000}"
-    return f"bring it up: ip link set {settings.channel} up{rate}"
-
-
-def _is_full(error: Exception) -> bool:
-    """Whether an interface can't take a frame only for the moment."""
-    if isinstance(error, can.CanTimeoutError):
-        return True
-    number = error.errno if isinstance(error, OSError) else getattr(error, "error_code", None)
-    return number in (errno.ENOBUFS, errno.EAGAIN) or "buffer full" in str(error)
-
-
-def _reason(error: Exception) -> str:
-    """One line."""
+def reason(error: Exception) -> str:
+    """What a driver raised, in one line."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return os.strerror(error.errno)
     return (str(error).splitlines() or [type(error).__name__])[0]

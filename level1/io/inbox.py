@@ -1,10 +1,16 @@
-"""What waits for the live loop: frames from the buses' threads, orders from above, notices about the world."""
+"""What waits for the live loop: frames, orders from above, reports and notices about the world; and what wakes it."""
 from __future__ import annotations
 
+import os
+import select
 import threading
+import weakref
 from collections import deque
+from collections.abc import Iterable
+from contextlib import suppress
 from typing import NamedTuple
 
+from level1.bus_health import Report
 from level1.command import Order
 from level1.frame import Frame
 
@@ -17,29 +23,38 @@ class Load(NamedTuple):
 
     frames: list[Frame]
     orders: list[Order]
+    reports: list[Report]
     notices: list[str]
     dropped: int
 
 
 class Inbox:
-    """Filled by any thread, emptied by one. Frames are bounded; orders and notices, which are few, are never dropped."""
+    """Filled by any thread, emptied by one. Frames are bounded; orders, reports and notices, which are few, are never dropped.
+
+    It wakes the one that waits, as do the descriptors it is told to `watch`: of sockets that the loop reads itself.
+    """
 
     def __init__(self, frames: int = FRAMES):
         self._frames: deque[Frame] = deque()
         self._limit = frames
         self._orders: list[Order] = []
+        self._reports: list[Report] = []
         self._notices: list[str] = []
         self._dropped = 0
         self._lock = threading.Lock()
-        self._filled = threading.Event()
+        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        weakref.finalize(self, os.close, self._bell)
+        self._rung = False
+        self._poll = select.epoll()
+        self._poll.register(self._bell, select.EPOLLIN)
 
-    def put(self, frame: Frame) -> None:
-        """A frame has come."""
+    def put(self, frames: Iterable[Frame]) -> None:
+        """Frames have come."""
         with self._lock:
-            if len(self._frames) >= self._limit:
+            self._frames.extend(frames)
+            while len(self._frames) > self._limit:
                 self._frames.popleft()
                 self._dropped += 1
-            self._frames.append(frame)
         self.wake()
 
     def order(self, order: Order) -> None:
@@ -48,26 +63,45 @@ class Inbox:
             self._orders.append(order)
         self.wake()
 
+    def report(self, reports: Iterable[Report]) -> None:
+        """Causes of alarms are there, or no more."""
+        with self._lock:
+            self._reports += reports
+        self.wake()
+
     def notice(self, text: str) -> None:
         """Something worth a line has happened outside."""
         with self._lock:
             self._notices.append(text)
         self.wake()
 
+    def watch(self, descriptor: int) -> None:
+        """End a `wait` when a descriptor becomes readable, until it is closed."""
+        self._poll.register(descriptor, select.EPOLLIN)
+
+    def forget(self, descriptor: int) -> None:
+        """Watch a descriptor no more; to be called before it is closed."""
+        with suppress(OSError, ValueError):
+            self._poll.unregister(descriptor)
+
     def wake(self) -> None:
         """End a `wait`, also from a signal handler."""
-        if not self._filled.is_set():
-            self._filled.set()
+        if not self._rung:
+            self._rung = True
+            os.eventfd_write(self._bell, 1)
 
     def wait(self, timeout_s: float) -> None:
         """Until something is there, at most so long."""
-        self._filled.wait(timeout_s)
+        self._poll.poll(timeout_s)
 
     def take(self) -> Load:
         """All that is there."""
-        self._filled.clear()
+        if self._rung:
+            self._rung = False
+            with suppress(BlockingIOError):
+                os.eventfd_read(self._bell)
         with self._lock:
-            load = Load(list(self._frames), self._orders, self._notices, self._dropped)
+            load = Load(list(self._frames), self._orders, self._reports, self._notices, self._dropped)
             self._frames.clear()
-            self._orders, self._notices, self._dropped = [], [], 0
+            self._orders, self._reports, self._notices, self._dropped = [], [], [], 0
         return load

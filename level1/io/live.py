@@ -2,29 +2,40 @@
 
 It waits for frames, orders or the next deadline; hands frames over in batches, in the order of their stamps; and brings what
 comes out to where it belongs: **events into the journal first, on the disk**, then frames to the buses, then results and
-monitoring messages to the link upward. Time is the monotonic clock; UTC is a label, measured anew at every turn, because
-the wall clock of a tractor jumps.
+monitoring messages to the link upward. On a busy bus waking up costs more than all the rest: between two turns of the loop there
+is at least `NAP_NS`, in which frames gather; a frame on a quiet bus is looked at at once.
+
+Time is the monotonic clock; UTC is a label, measured anew at every turn, because the wall clock of a tractor jumps.
 """
 from __future__ import annotations
 
+import time
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Sequence
 from typing import Protocol
 
 import msgspec
 
-from level1 import health
+from level1 import bus_health, health
+from level1.bus_health import Report
 from level1.event import Event, Monitor, Output, Result, Send
-from level1.frame import BUS_SHIFT, Frame
+from level1.frame import BUS_SHIFT, EXTENDED, Frame
 from level1.health import Reading
 from level1.io.can import Port
 from level1.io.host import clock_is_synchronised
 from level1.io.inbox import Inbox
+from level1.io.listening import listening
+from level1.j1939_node import ADDRESS_CLAIMED
 from level1.supervisor import State, Supervisor
 
 LAG_NS = 2_000_000
 """Deadlines are served so late, that a frame stamped before one, which its reader hands over a moment later, still counts."""
 LONGEST_WAIT_S = 1.0
+NAP_NS = 900_000
+LOSS_NS = 500_000_000
+"""So long after the last lost frame the loss is over."""
+DROPPED = "UCS"
+"""Key of the cause of `FramesLost` for frames of any bus that came faster than they were supervised."""
 TRUST_PERIOD_NS = 10_000_000_000
 
 
@@ -81,13 +92,14 @@ class Live:
     caller. told: called with every event once it is in the journal. notice: called with a line about the world (a bus lost,
     the journal's disk full). clock, wall: monotonic and wall clock in ns. dropped: frames that came faster than they were
     supervised. recorder, gnss, house: the traffic recorder, the GNSS receiver, the state of the computer, where there are any.
-    quiet: readings that are not sent on the buses.
+    quiet: readings that are not sent on the buses. nap: sleeps for so many seconds.
     """
 
     def __init__(self, supervisor: Supervisor, journal: EventStore, ports: Sequence[Port], inbox: Inbox, *,
                  clock: Callable[[], int], wall: Callable[[], int], told: Callable[[Event], None],
                  notice: Callable[[str], None], link: Link | None = None, recorder: Tap | None = None,
-                 gnss: Receiver | None = None, house: House | None = None, quiet: Collection[str] = ()):
+                 gnss: Receiver | None = None, house: House | None = None, quiet: Collection[str] = (),
+                 nap: Callable[[float], None] = time.sleep):
         self.supervisor, self.journal, self.ports, self.inbox = supervisor, journal, ports, inbox
         self.dropped = 0
         self._clock, self._wall, self._told, self._notice, self._link = clock, wall, told, notice, link
@@ -99,6 +111,15 @@ class Live:
         self._trust_due_ns = 0
         self._fault: str | None = None
         self._incidents = 0
+        self._nap = nap
+        self._busy = False
+        self._turned_ns = clock()
+        self._missing = 0
+        self._missing_ns: int | None = None
+        self._addresses: dict[int, int] = {}
+        self._begun = False
+        for port in ports:
+            self._listen(port)
 
     def stop(self) -> None:
         """End `run` soon; may be called from a signal handler."""
@@ -115,24 +136,92 @@ class Live:
 
     def turn(self, patience_s: float) -> None:
         """Wait at most so long for something to do, and do all there is."""
-        self.inbox.wait(patience_s)
+        self._wait(patience_s)
         load = self.inbox.take()
-        now_ns = self._clock()
+        frames = load.frames
+        for port in self.ports:
+            frames += port.fetch()
+        now_ns = self._turned_ns = self._clock()
+        self._busy = bool(frames)
         self._label(now_ns)
         for text in load.notices:
             self._notice(text)
         if load.dropped:
             self.dropped += load.dropped
             self._notice(f"{load.dropped} frames dropped, the oldest first: supervision can't keep up")
-        load.frames.sort(key=_stamp)
-        outputs = self._feed(load.frames, self._readings(load.frames, now_ns))
+        frames.sort(key=_stamp)
+        outputs = self._feed(frames, self._readings(frames, now_ns))
         self._served_ns = max(self._served_ns, now_ns - LAG_NS, self.supervisor.now_ns)
         for order in load.orders:
             outputs.extend(self.supervisor.command(order, self._served_ns))
         deadline = self.supervisor.next_deadline()
         if deadline is not None and deadline <= self._served_ns:
             outputs.extend(self.supervisor.tick(self._served_ns))
+        outputs.extend(self._tell(load.reports, load.dropped, now_ns))
         self._deliver(outputs)
+
+    def _wait(self, patience_s: float) -> None:
+        """Until something comes; on a busy bus until enough has come."""
+        rest_ns = self._turned_ns + NAP_NS - self._clock()
+        if self._busy and 0 < rest_ns <= NAP_NS and patience_s > 0:
+            self._nap(min(rest_ns / 1e9, patience_s))
+        else:
+            self.inbox.wait(patience_s)
+
+    # --- the health of the buses --------------------------------------------------------------------------------------
+
+    def _tell(self, reports: Sequence[Report], dropped: int, now_ns: int) -> Sequence[Output]:
+        """Causes of alarms that no condition raises."""
+        reports = [*reports, *self._drops(dropped, now_ns)]
+        if self._begun and not reports:
+            return ()
+        outputs: list[Output] = []
+        if not self._begun:
+            outputs += self.supervisor.tick(self._served_ns)
+            reports = [*self._old_causes(), *reports]
+            self._begun = True
+        for report in reports:
+            t_ns = max(min(report.t_ns, now_ns), self.supervisor.now_ns)
+            outputs += self.supervisor.tick(t_ns)
+            if report.present or report.key in self.supervisor.causes(report.alarm):
+                self.supervisor.report(t_ns, report.alarm, report.key, True, report.detail, report.text)
+            self.supervisor.report(t_ns, report.alarm, report.key, report.present, report.detail, report.text)
+            self.supervisor.board.settle(t_ns)
+        return outputs + list(self.supervisor.tick(self.supervisor.now_ns))
+
+    def _old_causes(self) -> list[Report]:
+        """What the last boot left: over, unless it is reported again."""
+        now_ns = self.supervisor.now_ns
+        return [Report(now_ns, alarm, key, False, detail, "") for alarm in bus_health.ALARMS
+                for key, detail in self.supervisor.causes(alarm).items()]
+
+    def _drops(self, dropped: int, now_ns: int) -> list[Report]:
+        """Frames that came faster than they were supervised."""
+        if dropped:
+            self._missing += dropped
+            self._missing_ns = now_ns
+        elif self._missing_ns is None or now_ns - self._missing_ns < LOSS_NS:
+            return []
+        else:
+            self._missing_ns = None
+        text = f"{self._missing} frames were lost because supervision could not keep up"
+        report = Report(now_ns, bus_health.LOST, DROPPED, bool(dropped), {"Frames": self._missing}, text)
+        if not dropped:
+            self._missing = 0
+        return [report]
+
+    def _listen(self, port: Port) -> None:
+        """Let the kernel hold back what nobody asks for."""
+        address = self._addresses.get(port.index)
+        port.listen(listening(self.supervisor, port.index, address, everything=self._recorder is not None))
+
+    def _follow(self, sends: Sequence[Send]) -> None:
+        """Listen to the address that the UCS claims."""
+        for send in sends:
+            bus, source = send.key >> BUS_SHIFT, send.key & 0xFF
+            if send.key & EXTENDED and send.key >> 8 & 0x3FF00 == ADDRESS_CLAIMED and self._addresses.get(bus) != source:
+                self._addresses[bus] = source
+                self._listen(self.ports[bus])
 
     def _readings(self, frames: Sequence[Frame], now_ns: int) -> list[Reading]:
         """What the UCS says of itself since the last turn, in the order of the stamps."""
@@ -173,6 +262,7 @@ class Live:
             self.journal.append(events, encode_state(self.supervisor.state()))
         now_ns = self._clock()
         sends = [output for output in outputs if isinstance(output, Send)]
+        self._follow(sends)
         for send in sends:
             self.ports[send.key >> BUS_SHIFT].send(send, now_ns)
         if sends and self._recorder is not None:

@@ -1,0 +1,216 @@
+"""What can befall a bus, on real SocketCAN: each its alarm within a second, over without a restart, told in the journal."""
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil_tests.conftest import ROOT, Process
+from level1.decode import encode
+from level1.frame import ERROR, EXTENDED
+from level1.io.definitions import load
+
+pytestmark = pytest.mark.vcan
+
+START_S = 30.0
+IN_TIME_S = 1.0
+"""The alarm of what befalls a bus."""
+OVER_S = 5.0
+UNIT = """
+[unit]
+name = "tractor-7"
+[[bus]]
+name = "tractor"
+channel = "vcan1"
+dbc = ["ucs.dbc"]
+[[bus]]
+name = "implement"
+channel = "vcan0"
+dbc = ["flaming_tool.dbc"]
+[journal]
+path = "journal.db"
+"""
+BABBLER = 0x18FE_F1AA
+ROUNDS = 100
+SEED = 20_261_122
+
+
+@pytest.fixture
+def run(process: Callable[..., Process], tmp_path: Path) -> Process:
+    """`ucs run` with two buses, supervising."""
+    (tmp_path / "unit.toml").write_text(UNIT)
+    started = process("run", "unit.toml")
+    started.expect("; supervising$", START_S)
+    return started
+
+
+@pytest.fixture
+def plug() -> Iterator[Plug]:
+    """The plug of vcan0; in again after the test."""
+    plug = Plug()
+    yield plug
+    plug.in_()
+
+
+class Plug:
+    """Takes vcan0 down or away, and brings it back."""
+
+    def __init__(self) -> None:
+        self.gone = False
+
+    def down(self) -> None:
+        _link("set", "vcan0", "down")
+
+    def out(self) -> None:
+        if not self.gone:
+            _link("del", "vcan0")
+            self.gone = True
+
+    def in_(self) -> None:
+        if self.gone:
+            _link("add", "vcan0", "type", "vcan")
+            self.gone = False
+        _link("set", "vcan0", "mtu", "72", "up")
+
+
+def _link(*words: str) -> None:
+    subprocess.run(["ip", "link", *words], check=True)
+
+
+class Wire:
+    """Sends what a test wants on vcan0; error message frames too, which vcan passes on as a driver's."""
+
+    def __init__(self) -> None:
+        self.sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        self.sock.bind(("vcan0",))
+
+    def __enter__(self) -> Wire:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.sock.close()
+
+    def send(self, can_id: int, data: bytes) -> None:
+        self.sock.send(struct.pack("=IB3x8s", can_id, len(data), data))
+
+    def error(self, classes: int, controller: int = 0) -> None:
+        self.send(ERROR | classes, bytes([0, controller, 0, 0, 0, 0, 0, 0]))
+
+
+def events(folder: Path) -> list[dict[str, Any]]:
+    """What the journal of a run that has ended tells."""
+    command = [sys.executable, "-m", "ucs", "journal", "unit.toml", "--format", "jsonl"]
+    written = subprocess.run(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True,
+                             capture_output=True, text=True).stdout
+    return [json.loads(line) for line in written.splitlines()]
+
+
+def lose_the_flame() -> None:
+    """What a flaming tool says for half a second whose pilot flame is out."""
+    message = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
+    payload = encode(message, {"Flaming": 1, "PilotFlame": 0}, None)
+    with Wire() as wire:
+        for _ in range(6):
+            wire.send(message.can_id, payload)
+            time.sleep(0.1)
+
+
+def test_a_link_that_goes_down_is_an_alarm_until_it_is_up(run: Process, plug: Plug) -> None:
+    plug.down()
+    run.expect("CanBusDown +raised", IN_TIME_S)
+    plug.in_()
+    run.expect("CanBusDown +cleared", OVER_S)
+
+
+def test_an_adapter_that_is_pulled_out_is_an_alarm_until_it_is_back(run: Process, plug: Plug) -> None:
+    plug.out()
+    run.expect("CanBusDown +raised", IN_TIME_S)
+    time.sleep(1)
+    plug.in_()
+    run.expect("CanBusDown +cleared", OVER_S)
+    lose_the_flame()
+    run.expect("PilotFlameOut +raised", OVER_S)
+
+
+@pytest.mark.parametrize(("classes", "controller", "alarm"), [(0x40, 0, "CanBusOff"), (0x4, 0x20, "CanBusErrors")])
+def test_a_controller_that_gives_up_is_an_alarm_until_it_is_well(
+        run: Process, plug: Plug, classes: int, controller: int, alarm: str) -> None:
+    with Wire() as wire:
+        wire.error(classes, controller)
+        run.expect(f"{alarm} +raised", IN_TIME_S)
+        wire.error(0x104, 0x40)  # restarted, error-active
+        run.expect(f"{alarm} +cleared", OVER_S)
+
+
+def test_after_bus_off_the_first_frame_proves_that_the_bus_is_back(run: Process, plug: Plug) -> None:
+    with Wire() as wire:
+        wire.error(0x40)
+        run.expect("CanBusOff +raised", IN_TIME_S)
+        wire.send(0x210, bytes(8))
+        run.expect("CanBusOff +cleared", OVER_S)
+
+
+@pytest.mark.parametrize("can_id", [EXTENDED | BABBLER, 0x210], ids=["nobody asks for", "of a message"])
+def test_an_identifier_that_babbles_is_named(run: Process, plug: Plug, can_id: int) -> None:
+    with Wire() as wire:
+        stop = threading.Event()
+
+        def babble() -> None:
+            while not stop.is_set():
+                for _ in range(20):
+                    wire.send(can_id, bytes(8))
+                stop.wait(0.01)
+        thread = threading.Thread(target=babble)
+        thread.start()
+        try:
+            run.expect("Babbling +raised", IN_TIME_S)
+        finally:
+            stop.set()
+            thread.join()
+    run.expect("Babbling +cleared", OVER_S)
+
+
+def test_frames_the_kernel_had_to_drop_are_told(run: Process, plug: Plug) -> None:
+    os.kill(run.pid, signal.SIGSTOP)  # not the group: `ip` and others of the test go on
+    with Wire() as wire:
+        for _ in range(30_000):
+            wire.send(0x210, bytes(8))
+    os.kill(run.pid, signal.SIGCONT)
+    run.expect("FramesLost +raised", 3 * IN_TIME_S)
+
+
+def test_plugs_pulled_a_hundred_times_leave_a_supervisor_that_works_and_a_journal_that_tells(
+        run: Process, plug: Plug, tmp_path: Path) -> None:
+    chance = random.Random(SEED)
+    pulled_ns, plugged_ns = [], []
+    for _ in range(ROUNDS):
+        pulled_ns.append(time.monotonic_ns())
+        chance.choice((plug.down, plug.out))()
+        time.sleep(chance.uniform(0.05, 0.25))
+        plug.in_()
+        plugged_ns.append(time.monotonic_ns())
+        time.sleep(chance.uniform(0.0, 0.2))
+    time.sleep(1)
+    lose_the_flame()
+    run.expect("PilotFlameOut +raised", 2 * OVER_S)
+    assert run.stop() == 0
+    told = [event for event in events(tmp_path) if event["alarm"] == "CanBusDown"]
+    assert [event["event"] for event in told] == ["raised", "cleared"] * (len(told) // 2)
+    gaps = [(raised["t"] * 1e9, cleared["t"] * 1e9) for raised, cleared in zip(told[::2], told[1::2], strict=True)]
+    for raised, cleared in zip(told[::2], told[1::2], strict=True):
+        assert cleared["values"]["AwaySeconds"] == pytest.approx(cleared["t"] - raised["t"], abs=0.01)
+    for pulled, plugged in zip(pulled_ns, plugged_ns, strict=True):
+        assert any(begin <= pulled + IN_TIME_S * 1e9 and end >= plugged for begin, end in gaps), "a pull that nobody was told of"
+    print(f"{ROUNDS} plugs pulled; {len(gaps)} gaps told, {sum(end - begin for begin, end in gaps) / 1e9:.1f} s in all")
