@@ -15,7 +15,7 @@ from level1.condition import children
 from level1.expression import And, Arithmetic, Compare, Expression, Function, Not, Number, Or
 from level1.io import config, definitions
 from level1.io.error import OutsideError, did_you_mean
-from ucs import season
+from ucs import parquet, season
 from ucs.comparison import Comparison, Recorded, Side, span_text
 from ucs.render import painted, wants_colour
 from ucs.spans import Behaviour, Change, behaviour, changes, spans
@@ -50,6 +50,8 @@ def add_parser(commands: Any) -> None:
                         "AlarmOffDelay (0.5s), or of the only number in AlarmWhen, AlarmUntil or AlarmEnabledWhen")
     parser.add_argument("--tolerance", type=_duration_s, default=0.0, metavar="TIME", help="differences up to this count as none")
     parser.add_argument("--format", choices=("text", "json"), default="text")
+    parser.add_argument("--parquet", metavar="OUT.parquet", help="write the events of each side (old, new, or the value tried) as "
+                        "a table for DuckDB, Polars and the like")
     parser.add_argument("--html", metavar="OUT.html", help="write a report with pictures, which opens without a network")
     add_season_arguments(parser)
 
@@ -82,6 +84,7 @@ def run(args: Namespace) -> int:
 def compare(paths: Sequence[str], old: tuple[str, Catalog], new: tuple[str, Catalog], args: Namespace) -> Comparison:
     """Both sets of definitions over all recordings. Raises OutsideError when no recording could be used."""
     outcomes = _outcomes(paths, [old[1], new[1]], args)
+    _write_table(args.parquet, (old[0], new[0]), outcomes)
     recorded = _recorded(outcomes[0])
     sides = [Side(name, {outcome.path: spans(outcome.decoded()) for outcome in found})
              for (name, _), found in zip((old, new), outcomes, strict=True)]
@@ -100,6 +103,15 @@ def _outcomes(paths: Sequence[str], catalogs: Sequence[Catalog], args: Namespace
     return [done[start:start + len(paths)] for start in range(0, len(done), len(paths))]
 
 
+def _write_table(out: str | None, sides: Sequence[str], outcomes: Sequence[Sequence[season.Outcome]]) -> None:
+    if out is None:
+        return
+    with parquet.table(out) as table:
+        for side, found in zip(sides, outcomes, strict=True):
+            for outcome in found:
+                table.add(outcome.path, outcome.decoded(), side)
+
+
 def _recorded(outcomes: Sequence[season.Outcome]) -> list[Recorded]:
     used = [Recorded(outcome.path, outcome.first_ns / 1e9, outcome.last_ns / 1e9, outcome.hours) for outcome in outcomes
             if not outcome.error]
@@ -115,6 +127,7 @@ def _run_sweep(args: Namespace, catalog: Catalog, paths: Sequence[str]) -> int:
     sweep: Sweep = args.sweep
     variants = [varied(catalog, sweep, value) for value in sweep.values]
     outcomes = _outcomes(paths, variants, args)
+    _write_table(args.parquet, sweep.values, outcomes)
     recorded = _recorded(outcomes[0])
     hours = sum(each.hours for each in recorded)
     rows = []

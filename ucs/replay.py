@@ -6,18 +6,19 @@ import sys
 import time
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from typing import Any, BinaryIO, NamedTuple, TextIO
 
 from level1.catalog import NORMAL, Catalog
 from level1.event import Event, Send, encode, seconds
+from level1.frame import Frame
 from level1.io import config, definitions
 from level1.io.error import OutsideError
 from level1.io.merged import MergedLog
 from level1.io.replay import Log
 from level1.supervisor import STATE_WORDS, Supervisor
-from ucs import parquet, season
+from ucs import onto, parquet, season
 from ucs.diff import add_season_arguments
 from ucs.remarks import remarks
 from ucs.render import WORDS, event_line, painted, since, wants_colour
@@ -25,6 +26,7 @@ from ucs.render import WORDS, event_line, painted, since, wants_colour
 UNIT, BOOT = "replay", 1
 """Identity of a replay's events; every recording is a run of its own, so that it gives the same bytes beside others."""
 PROGRESS_S = 0.2
+Through = Callable[[Iterator[list[Frame]]], Iterator[list[Frame]]]
 POOL_BYTES = 8 << 20
 """Recordings smaller than this together are not worth other processes (each takes about a second to start)."""
 
@@ -44,6 +46,11 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--unit-toml", metavar="FILE", help="which repairs are armed, which files belong to which bus")
     parser.add_argument("--bus", action="append", default=[], metavar="NAME=INDEX", type=_bus,
                         help="take this channel of the recording (with --merge also: this file) as the bus of that index (from 0)")
+    parser.add_argument("--onto", action="append", default=[], metavar="[CHANNEL=]INTERFACE", type=onto.target,
+                        help="play the recording onto this bus, such as vcan0, in real time; --dbc may be left out then")
+    parser.add_argument("--speed", type=onto.speed, metavar="N", help="with --onto: so many times faster than recorded (1)")
+    parser.add_argument("--interface", metavar="NAME", help=f"with --onto: any interface of python-can ({onto.INTERFACE})")
+    parser.add_argument("--bitrate", type=int, metavar="N", help="with --onto: bit/s, for interfaces that need it")
     parser.add_argument("--merge", action="store_true", help="the recordings are of one drive: one run, in the order of time")
     add_season_arguments(parser)
 
@@ -51,14 +58,20 @@ def add_parser(commands: Any) -> None:
 def run(args: Namespace) -> int:
     """Replay every recording; 2 when one could not be used."""
     unit = config.load(args.unit_toml) if args.unit_toml else None
-    if not args.dbc and unit is None:
+    if not args.dbc and unit is None and not args.onto:
         raise OutsideError("no definitions: give --dbc FILE …, or --unit-toml FILE")
     paths = season.recordings(args.log)
-    catalog = definitions.load(args.dbc) if args.dbc or unit is None else definitions.load((), unit.bus_files, unit.bus_names)
+    _check_onto(args, paths)
+    if args.dbc or unit is None:
+        catalog = definitions.load(args.dbc) if args.dbc else Catalog((), {}, {})
+    else:
+        catalog = definitions.load((), unit.bus_files, unit.bus_names)
     if unit:
         config.check_armed(unit, catalog)
     task = _Task(catalog, tuple(unit.repairs.armed) if unit else None,
                  {**(_bus_names(unit) if unit and not args.dbc else {}), **dict(args.bus)}, tuple(name for name, _ in args.bus))
+    if args.onto:
+        return _run_onto(paths, task, args)
     with ExitStack() as stack:
         out = _Out(args, stack)
         if len(paths) > 1 and not args.merge:
@@ -74,11 +87,11 @@ class _Task(NamedTuple):
     buses: dict[str, int]
     asked: tuple[str, ...]
 
-    def replay(self, paths: Sequence[str]) -> Replay:
+    def replay(self, paths: Sequence[str], through: Through | None = None) -> Replay:
         """Of one recording, or of several as one. Raises LogError."""
         one_bus = not self.buses
         log = Log(paths[0], self.buses, one_bus=one_bus) if len(paths) == 1 else MergedLog(paths, self.buses, one_bus=one_bus)
-        return Replay(log, self.catalog, self.armed)
+        return Replay(log, self.catalog, self.armed, through)
 
     def job(self, path: str, catalog: bytes) -> season.Job:
         """The same, for another process."""
@@ -88,11 +101,13 @@ class _Task(NamedTuple):
 class Replay:
     """A recording run through a supervisor of its own.
 
+    through: what takes the batches of frames on their way and hands them on (plays, draws), None for nothing.
     counts: (alarm, event) -> how often. sends: frames that repairs would have sent. keys: of all frames seen.
     """
 
-    def __init__(self, log: Log | MergedLog, catalog: Catalog, armed: Collection[str] | None):
+    def __init__(self, log: Log | MergedLog, catalog: Catalog, armed: Collection[str] | None, through: Through | None = None):
         self.log = log
+        self.through = through
         self.supervisor = Supervisor(catalog, unit=UNIT, boot=BOOT, armed=armed, broadcast=False)
         self.counts: Counter[tuple[str, str]] = Counter()
         self.sends = 0
@@ -100,7 +115,8 @@ class Replay:
 
     def batches(self) -> Iterator[list[Event]]:
         """The events, a list for each batch of frames; ends with the deadlines up to the last time stamp."""
-        for batch in self.log.batches():
+        batches = self.log.batches()
+        for batch in self.through(batches) if self.through else batches:
             if self.log.is_utc:
                 self.supervisor.utc_offset_ns = 0
             self.keys.update([frame.key for frame in batch])
@@ -172,10 +188,42 @@ class _Out:
         self.end(outcome, counts)
 
 
-def _run_one(paths: Sequence[str], task: _Task, out: _Out) -> int:
+def _check_onto(args: Namespace, paths: Sequence[str]) -> None:
+    """Whether what belongs to `--onto` fits together. Raises OutsideError."""
+    if not args.onto:
+        if args.speed or args.interface or args.bitrate:
+            raise OutsideError("--speed, --interface and --bitrate need the bus to play onto: --onto vcan0")
+        return
+    if len(paths) > 1 and not args.merge:
+        raise OutsideError(f"{len(paths)} recordings can't be played at once; give one, or --merge if they are of one drive")
+    if len(args.onto) > 1 and not all(name for name, _ in args.onto):
+        raise OutsideError("several buses: say which channel goes where, --onto can0=vcan0 --onto can1=vcan1")
+
+
+def _run_onto(paths: Sequence[str], task: _Task, args: Namespace) -> int:
+    """Play onto buses; with definitions, supervised at the same time."""
+    named = {name: index for index, (name, _) in enumerate(args.onto) if name}
+    task = task._replace(buses={**task.buses, **named}, asked=(*task.asked, *named))
+    with ExitStack() as stack:
+        player = onto.Player(stack.enter_context(onto.opened(args.onto, args.interface, args.bitrate)), args.speed or 1.0)
+        out = _Out(args, stack)
+        try:
+            if args.dbc or args.unit_toml:
+                return _run_one(paths, task, out, player.play)
+            replay = task.replay(paths)
+            for _ in player.play(replay.log.batches()):
+                pass
+            for line in remarks(replay.log, {}, (), task.catalog, task.asked):
+                print(f"ucs: {replay.log.path}: {line}", file=sys.stderr)
+            return 0
+        finally:
+            print(player.summary(), file=out.text, flush=True)
+
+
+def _run_one(paths: Sequence[str], task: _Task, out: _Out, through: Through | None = None) -> int:
     """One recording, or several as one: told as it is read."""
     try:
-        replay = task.replay(paths)
+        replay = task.replay(paths, through)
         started, name = time.perf_counter(), str(replay.log.path)
         progress = _Progress(sys.stderr, replay.log)
         out.begin(name)

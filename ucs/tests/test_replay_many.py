@@ -223,6 +223,15 @@ def test_parquet_holds_every_event_with_typed_columns(replay: Run, folder: Path)
     assert str(table.schema.field("t").type) == "decimal128(20, 9)" and rows[0]["recording"].endswith("a.log")
 
 
+def test_a_comparison_writes_both_sides(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "late.dbc").write_text(TEXT.replace("TankLow 500;", "TankLow 1500;"))
+    words = (folder / "season", "--dbc", folder / "tank.dbc", "--against", folder / "late.dbc", "--parquet", folder / "e.parquet")
+    assert main.main(["diff", *map(str, words), "--jobs", "1"]) == 1
+    rows = importlib.import_module("pyarrow.parquet").read_table(folder / "e.parquet").to_pylist()
+    assert [(row["side"], Path(row["recording"]).stem) for row in rows if row["event"] == "raised"] == [
+        ("old", "a"), ("old", "b"), ("old", "c"), ("new", "a"), ("new", "b")]
+
+
 def test_a_table_that_cannot_be_written_is_told(replay: Run, folder: Path) -> None:
     code, _, err = replay(folder / "season", "--dbc", folder / "tank.dbc", "--parquet", folder / "none" / "e.parquet")
     assert code == 2 and err.startswith(f"ucs: {folder / 'none' / 'e.parquet'}: can't be written")
