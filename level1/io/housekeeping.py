@@ -23,8 +23,12 @@ class Bus(Protocol):
     """What is needed of `level1.io.can.Port`."""
 
     @property
-    def is_lost(self) -> bool:
-        """Whether the interface is gone."""
+    def state(self) -> str:
+        """A word of `health.BUS_STATES`."""
+
+    @property
+    def load_percent(self) -> float | None:
+        """Share of the bit rate in use; None: not known."""
 
 
 class Store(Protocol):
@@ -87,6 +91,7 @@ class Housekeeping:
         not_recorded = 0 if recorder is None else recorder.dropped
         state = Loop(
             lateness_ns=self._lateness_ns, frames_dropped=dropped - self._dropped, bus_state=bus_state(self._buses),
+            bus_load_percent=max((bus.load_percent for bus in self._buses if bus.load_percent is not None), default=None),
             journal=journal_word(fault), storage_writes=fault is None,
             recorder_works=None if recorder is None else recorder.fault is None,
             recorder_dropped=None if recorder is None else not_recorded - self._not_recorded)
@@ -94,9 +99,9 @@ class Housekeeping:
         return state
 
 
-def bus_state(buses: Sequence[Bus]) -> str:
-    """State of the worst of the buses, a word of `BUS_STATES`."""
-    return BUS_STATES[-1] if any(bus.is_lost for bus in buses) else BUS_STATES[0]
+def bus_state(buses: Sequence[Bus]) -> str | None:
+    """State of the worst of the buses, a word of `BUS_STATES`; None without a bus."""
+    return max((bus.state for bus in buses), key=BUS_STATES.index, default=None)
 
 
 def journal_word(fault: str | None) -> str:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from level1 import health
 from level1.decode import ERROR, GOOD, UNAVAILABLE, Scale, encode, quality_of, raw_of
-from level1.event import Event, Monitor, Send
+from level1.event import Event, Send
 from level1.frame import Frame, frame_key
 from level1.health import (
     GNSS_MESSAGES,
@@ -264,7 +264,8 @@ class Fixed:
     def __init__(self) -> None:
         self.fault: str | None = None
         self.incidents: tuple[str, ...] = ()
-        self.is_lost = False
+        self.state = "BusActive"
+        self.load_percent: float | None = None
         self.dropped = 0
         self.fix: int | None = None
         self.offset_ns: int | None = None
@@ -314,12 +315,13 @@ class TestHousekeeping:
         computer, journal, recorder, gnss = Computer(), Fixed(), Fixed(), Fixed()
         buses = [Fixed(), Fixed()]
         computer.measured = [(S, Host(clock_synchronised=False))]
-        journal.fault, recorder.fault, buses[1].is_lost, gnss.fix, gnss.offset_ns = "journal x: …full", "full", True, 0, 5
+        journal.fault, recorder.fault, buses[1].state, gnss.fix, gnss.offset_ns = "journal x: …full", "full", "BusPassive", 0, 5
+        buses[0].load_percent, buses[1].load_percent = 30.0, 40.0
         values = housekeeping.Housekeeping(computer, buses, journal, recorder, gnss).take(0, 0)[0].values
         assert {**values} == {
             "CpuTemperature": None, "MainboardTemperature": None, "RamUsed": None, "StorageUsed": None, "StorageWrite": "Failed",
-            "TrafficLog": "Failed", "BusState": "BusDown", "TimeSync": "Synchronised", "JournalState": "JournalFull",
-            "GnssQuality": "NoFix", "LoopLateness": 0.0, "BusLoad": None}
+            "TrafficLog": "Failed", "BusState": "BusPassive", "TimeSync": "Synchronised", "JournalState": "JournalFull",
+            "GnssQuality": "NoFix", "LoopLateness": 0.0, "BusLoad": 40.0}
 
     def test_a_unit_without_recorder_and_receiver_says_nothing_of_them(self) -> None:
         computer = Computer()
