@@ -54,11 +54,15 @@ class Codec:
         return round((self._messages[name].cycle_time or 0) * 1_000_000)
 
     def encode(self, name: str, values: Mapping[str, Value]) -> bytes:
-        """Payload of a message; every signal is given, by name and in range, else cantools' EncodeError is raised."""
+        """Payload of a message; every signal is given, by name and in range, else cantools' EncodeError is raised.
+
+        Bits that no signal has are 0, in messages of 29-bit identifiers 1, as J1939 has it (SAE J1939-71).
+        """
         key = (name, *values.values())
         payload = self._encoded.get(key)
         if payload is None:
-            payload = bytes(self._messages[name].encode(dict(values), strict=True))
+            message = self._messages[name]
+            payload = bytes(message.encode(dict(values), padding=message.is_extended_frame, strict=True))
             _remember(self._encoded, key, payload)
         return payload
 

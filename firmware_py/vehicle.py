@@ -58,7 +58,7 @@ NO_VALUE = bytes([0xFF] * 8)
 LIMIT, REQUEST = "DriveSpeedLimit", "Request"
 MOVABLE = ("Ready", "Executing")
 HELD = ("Stopped", "Manual", "Disabled")
-REASONS = {"Command": "on command", "Switch": "by the stop switch", "CommandsLost": "without the mission controller's signs of life",
+REASONS = {"Command": "on command", "Switch": "by the stop switch", "CommandsLost": "without signs of life of the mission",
            "NotMoving": "because it does not move", "PositionLost": "without a position"}
 
 
@@ -131,12 +131,13 @@ class Vehicle(Node):
         self.reason = "None"
         self.mission = "Loaded"
         self.fix = "RtkFixed"
-        self.nmea: Callable[[bytes], None] | None = None
+        self.nmea: Callable[[bytes], object] | None = None
         self.utc_start_ns = UTC_START_NS
         self._nmea_ns = round(1e9 / chosen["nmea_rate"])
         self._nmea_due_ns = start_ns
         self._limit_kmh = TOP_KMH
         self._guided_ns = self._placed_ns = self._moved_ns = start_ns
+        self._guide_counter: Value | None = None
         self._heard_as: dict[str, tuple[int, Mapping[str, Value]]] = {}
         self._released = {"PtoWanted": False, "ImplementWanted": False}
         self._hitch_held = True
@@ -151,7 +152,9 @@ class Vehicle(Node):
     def hear(self, t_ns: int, message: str, values: Mapping[str, Value]) -> None:
         """A request or a command."""
         if message == "VEHICLE_GUIDE":
-            self._guided_ns = t_ns
+            if values["GuideCounter"] != self._guide_counter:
+                self._guided_ns = t_ns
+            self._guide_counter = values["GuideCounter"]
         elif message == "VEHICLE_CMD":
             self._limit_kmh = float(values[LIMIT])
             self._request(t_ns, str(values[REQUEST]))

@@ -19,8 +19,10 @@ from firmware_py.fault import Phrase
 from firmware_py.participant import BusFrame, Happening
 from firmware_py.quantity import QuantityError, duration_ns
 from firmware_py.scenario import PROGRAMS, Cast, Scenario, ScenarioError, build, parse
+from firmware_py.vehicle import Vehicle
 from firmware_py.virtual_bus import Simulation
 from level1.io.error import OutsideError, did_you_mean
+from ucs.nmea_line import nmea_file, nmea_line
 
 SHIPPED = Path(__file__).parent / "scenarios"
 EXTENDED_DIGITS, STANDARD_DIGITS = 8, 3
@@ -46,6 +48,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--seed", type=int, help="instead of the scenario's")
     parser.add_argument("--patience", default=PATIENCE, metavar="TIME", help=f"how long a lost bus may stay away ({PATIENCE})")
     parser.add_argument("--log", metavar="OUT.log", help="write the traffic as a candump file")
+    parser.add_argument("--nmea", type=Path, metavar="PATH",
+                        help="what the tractor's GNSS receiver says: on a bus a serial line of that name, "
+                             "which `ucs run` and others can open; in virtual time a file")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,10 +70,26 @@ def run(args: argparse.Namespace) -> int:
     cast = build(scenario, seed=args.seed, only=args.node)
     live = bool(args.bus or args.interface or args.channel)
     channel = str(args.bus or args.channel or "vcan0")
-    with open(args.log, "w", encoding="ascii") if args.log else nullcontext() as log:
+    with open(args.log, "w", encoding="ascii") if args.log else nullcontext() as log, _receiver(args.nmea, cast, live):
         base_ns = time.time_ns() if live else 0
         on_frame = _recorder(log, channel, base_ns) if log is not None else None
         return _run_live(args, scenario, cast, on_frame) if live else _run_virtual(scenario, cast, on_frame)
+
+
+@contextmanager
+def _receiver(path: Path | None, cast: Cast, live: bool) -> Iterator[None]:
+    """The tractor's GNSS receiver says its sentences there. Raises OutsideError."""
+    if path is None:
+        yield
+        return
+    tractors = [node for node in cast.nodes.values() if isinstance(node, Vehicle)]
+    if not tractors:
+        raise OutsideError('--nmea: no node of this scenario has a GNSS receiver; one needs program = "vehicle"')
+    with (nmea_line if live else nmea_file)(path) as write:
+        tractors[0].nmea = write
+        if live:
+            tractors[0].utc_start_ns = time.time_ns()
+        yield
 
 
 def load(name: str) -> Scenario:

@@ -3,18 +3,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from decimal import Decimal
+from pathlib import Path
 
 import pytest
+import serial
 
 from firmware_py.drive import KMH
+from firmware_py.field import to_degrees
 from firmware_py.scenario import build, parse
-from firmware_py.vehicle import Vehicle
+from firmware_py.vehicle import UTC_START_NS, Vehicle
 from firmware_py.virtual_bus import Simulation
 from level1.catalog import Catalog
 from level1.command import Order
 from level1.event import Event, Output, Result
 from level1.io import definitions
+from level1.navigation import FIXES
+from level1.nmea import Navigator
 from level1.supervisor import Supervisor
+from ucs.main import main
+from ucs.nmea_line import nmea_line
 from ucs.simulate import SHIPPED, load
 from ucs.simulated_unit import SimulatedUnit
 
@@ -126,6 +133,7 @@ TABLE = [
     ("VehicleSilent", ["at 20 s: tractor silent for 5 s"], ["raised", "cleared"], None),
     ("VehicleFrozen", ["at 20 s: tractor frozen for 5 s"], ["raised", "cleared"], {"VehicleFrozen", "VehicleCommandsLost"}),
     ("VehicleCommandsLost", ["at 20 s: mission silent for 3 s"], ["raised"], {"VehicleCommandsLost"}),
+    ("VehicleCommandsLost", ["at 20 s: mission frozen for 3 s"], ["raised"], {"VehicleCommandsLost"}),
     ("PositionLost", ["at 20 s: tractor.gnss lost for 10 s"], ["raised", "cleared"], {"PositionLost"}),
     ("PositionInaccurate", ["at 20 s: tractor.gnss float for 20 s"], ["raised", "cleared"], {"PositionInaccurate"}),
     ("OilPressureSensorFault", ["at 20 s: tractor.oil_sensor unplugged for 20 s"], ["raised", "cleared"],
@@ -272,3 +280,59 @@ def test_stop_and_pause_go_through_in_the_middle_of_every_repair(catalog: Catalo
     assert "repair_started" in {event.event for event in busy.events}
     assert busy.order(order) == ""
     assert busy.run(12).kmh == 0
+
+
+# --- its GNSS receiver --------------------------------------------------------------------------------------------------------
+
+
+def test_what_its_receiver_says_is_where_it_is(catalog: Catalog) -> None:
+    navigator = Navigator()
+    driving = farm(catalog, "at 40 s: tractor.gnss float for 10 s", "at 70 s: tractor.gnss lost")
+    driving.tractor.nmea = lambda data: navigator.feed(driving.simulation.now_ns, data)
+    for until_s, fix in ((30, "RtkFixed"), (45, "RtkFloat"), (65, "RtkFixed")):
+        driving.run(until_s)
+        said = navigator.navigation(driving.simulation.now_ns)
+        pose = driving.tractor.drive.pose
+        latitude, longitude = to_degrees(pose.x_m, pose.y_m)
+        assert said.latitude_deg == pytest.approx(latitude, abs=2e-7)
+        assert said.longitude_deg == pytest.approx(longitude, abs=2e-7)
+        assert said.heading_deg == pytest.approx(pose.heading_deg, abs=0.01)
+        assert said.speed_km_h == pytest.approx(driving.kmh, abs=0.01)
+        assert said.fix is not None and FIXES[said.fix] == fix
+        assert said.utc_ns is not None
+        assert abs(said.utc_ns - UTC_START_NS - until_s * SECOND) <= SECOND // 5
+    driving.run(80)
+    assert navigator.navigation(driving.simulation.now_ns).latitude_deg is None
+    assert set(navigator.counters) == {"sentences"}
+
+
+def test_in_virtual_time_its_sentences_go_to_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "gnss.nmea"
+    assert main(["simulate", "vehicle_healthy.toml", "--duration", "10 s", "--nmea", str(file)]) == 0
+    sentences = file.read_bytes().split(b"\r\n")
+    assert len(sentences) == 4 * 101 + 1
+    assert all(len(sentence) <= 100 for sentence in sentences)
+
+
+def test_on_a_bus_its_sentences_go_to_a_serial_line_that_can_be_opened(tmp_path: Path) -> None:
+    line = tmp_path / "gnss"
+    with nmea_line(line) as write:
+        for _ in range(1000):
+            write(b"$GNHDT,90.00,T*1A\r\n")
+        with serial.serial_for_url(str(line), timeout=1) as port:
+            port.reset_input_buffer()
+            write(b"$GNHDT,91.00,T*1B\r\n")
+            assert port.read_until() == b"$GNHDT,91.00,T*1B\r\n"
+    assert not line.is_symlink()
+
+
+@pytest.mark.parametrize(("name", "scenario", "error"), [
+    ("new", "healthy.toml", "no node of this scenario has a GNSS receiver"),
+    ("taken", "vehicle_healthy.toml", "there is something of that name already"),
+    ("no/such/folder", "vehicle_healthy.toml", "No such file or directory")])
+def test_a_line_that_can_not_be_made_is_one_line_and_code_2(tmp_path: Path, name: str, scenario: str, error: str,
+                                                            capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "taken").touch()
+    bus = ["--interface", "virtual", "--channel", "nmea", "--duration", "1 s"]
+    assert main(["simulate", scenario, "--nmea", str(tmp_path / name), *bus]) == 2
+    assert error in capsys.readouterr().err
