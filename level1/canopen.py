@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from fractions import Fraction
 from typing import Any, Protocol
 
 import msgspec
@@ -33,8 +34,8 @@ DEVICE_EMERGENCY, DEVICE_SILENT = "DeviceEmergency", "DeviceSilent"
 NMT, EMERGENCY, SDO_ANSWER, HEARTBEAT = 0x000, 0x080, 0x580, 0x700
 """Identifiers of the predefined connection set; all but NMT's plus the node id."""
 NODES = range(1, 128)
-MARGIN = 3
-"""Heartbeat times without a heartbeat that make a device silent: two frames may be lost. As for messages (`STALE_CYCLES`)."""
+MARGIN = Fraction(7, 2)
+"""Heartbeat times without a heartbeat that make a device silent: two frames may be lost, and the third be late."""
 SHORTEST_NS = 300_000_000
 """Silence that is never told: heartbeats of 100 ms and less may come as late as that."""
 LONGEST_LEARNED_NS = 65_535_000_000
@@ -165,7 +166,7 @@ class _Node:
         """When it counts as silent if nothing comes; None: never."""
         if not self.heartbeat_ns:
             return None
-        return max(self.last_ns + max(MARGIN * self.heartbeat_ns, SHORTEST_NS), self.boots_ns)
+        return max(self.last_ns + max(round(MARGIN * self.heartbeat_ns), SHORTEST_NS), self.boots_ns)
 
     def sign(self, t_ns: int, state: int) -> None:
         """A boot-up or heartbeat."""
