@@ -8,6 +8,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 WIDTH_M, LENGTH_M = 42.5, 41.5
@@ -82,6 +83,12 @@ class WeedMap:
         if not (0 <= x_m < WIDTH_M and 0 <= y_m < LENGTH_M):
             return False
         return bool(self.cells[int(y_m / CELL_M)][int(x_m / CELL_M)])
+
+
+@cache
+def paper_map() -> WeedMap:
+    """The map of `PATCHES`."""
+    return WeedMap()
 
 
 class Pose(NamedTuple):

@@ -2,7 +2,8 @@
 
 Every tick of 50 ms: commands → boom, pumps, set points, section valves → plant. Commands are cyclic; 400 ms after the last one all
 sections close and the pumps stop. Drivers are energised once a command: a part that did not obey tries again on Retry only.
-Someone at the hand panel (Control Manual) is safe: nothing is sprayed, nothing moves, whatever comes over the bus.
+Someone at the hand panel (Control Manual) is safe: nothing is sprayed, nothing moves, whatever comes over the bus; and when the
+panel is left, still nothing does until Off and Stop were commanded once.
 """
 from __future__ import annotations
 
@@ -86,14 +87,14 @@ class SprayerBoom(Node):
         Phrase("boom", "refuses", "does not begin to move", counted=True),
         Phrase("boom", "slow", "takes three times as long"),
         Phrase("boom", WORKS, "moves again", lasts=False),
-        Phrase("main_tank", "leaks", "10 L/min run out"),
+        Phrase("main_tank", "leaks", "20 L/min run out"),
         Phrase("main_tank", "empty", "all water is gone", lasts=False),
         Phrase("main_tank", "filled", "someone fills it up to 200 L", lasts=False),
         Phrase("main_tank", WORKS, "is tight", lasts=False),
         Phrase("dis_tank", "empty", "all herbicide is gone", lasts=False),
         Phrase("dis_tank", "filled", "someone fills it up to 10 L", lasts=False),
-        Phrase("level_sensor", "drifts up", "reads 10 L more each minute"),
-        Phrase("level_sensor", "drifts down", "reads 10 L less each minute"),
+        Phrase("level_sensor", "drifts up", "reads 20 L more each minute"),
+        Phrase("level_sensor", "drifts down", "reads 20 L less each minute"),
         Phrase("level_sensor", WORKS, "drifts no further", lasts=False),
         Phrase("", "manual", "someone takes the hand panel"),
         Phrase("", "wrong counter", "the counter of its status runs backwards"),
@@ -122,6 +123,7 @@ class SprayerBoom(Node):
         self._dis_set = Actuator(0.0, 0, retry_ns=None)
         self._heard_as: dict[str, tuple[int, Mapping[str, Value]]] = {}
         self._manual = False
+        self._gated: set[str] = set()
         self._lost = False
         self._counter = 0
         self._wrong = ""
@@ -150,12 +152,15 @@ class SprayerBoom(Node):
         before_ns, before = self._heard_as.get(message, (t_ns, {}))
         self._heard_as[message] = (t_ns, values)
         if message in SECTION_ORDERS:
-            self._order(t_ns, SECTION_ORDERS[message], values["Order"],
-                        is_new=values != before or t_ns - before_ns >= ORDER_TIMEOUT_NS)
-        elif values.get("Retry") == "On" and before.get("Retry") != "On" and not self._manual:
+            is_new = values != before or t_ns - before_ns >= ORDER_TIMEOUT_NS
+            self._order(t_ns, SECTION_ORDERS[message], values["Order"], is_new)
+            return
+        if values.get("SprayingWanted") == "Off" or values.get("BoomWanted") == "Stop":
+            self._gated.discard(message)
+        if values.get("Retry") == "On" and before.get("Retry") != "On" and not self._manual:
             self._retry(t_ns, message)
 
-    def _order(self, t_ns: int, section: int, order: Value, *, is_new: bool) -> None:
+    def _order(self, t_ns: int, section: int, order: Value, is_new: bool) -> None:
         valve = self.valves[section - 1]
         if order == "Close":
             self.locked.add(section)
@@ -195,7 +200,7 @@ class SprayerBoom(Node):
             self._lost = wanted is None and (self._lost or self.spraying)
         remote = self.powered and not self._manual
         self._fold(t_ns, remote)
-        works = remote and wanted == "On" and self.boom.state == "Open"
+        works = remote and wanted == "On" and "SPRAYER_CMD" not in self._gated and self.boom.state == "Open"
         if not self.powered:
             self._mode.force("Off")
         self._mode.advance(t_ns, "On" if works else "Off")
@@ -211,8 +216,9 @@ class SprayerBoom(Node):
     def _fold(self, t_ns: int, remote: bool) -> None:
         """The boom moves while it is commanded to, by nobody else, and nothing is sprayed."""
         wanted = self._last("SPRAYER_BOOM_CMD", "BoomWanted", t_ns, BOOM_TIMEOUT_NS)
-        moves = remote and not self.spraying and wanted in ("Open", "Close")
-        self.boom.advance(t_ns, str(wanted) if moves else "Stop", self.TICK_NS / 1e9)
+        moves = remote and not self.spraying and "SPRAYER_BOOM_CMD" not in self._gated and wanted in ("Open", "Close")
+        held = self._last("SPRAYER_BOOM_CMD", "Retry", t_ns, BOOM_TIMEOUT_NS) == "On"
+        self.boom.advance(t_ns, str(wanted) if moves else "Stop", self.TICK_NS / 1e9, held=held)
 
     def _take_over(self, t_ns: int) -> None:
         """Set points."""
@@ -280,6 +286,7 @@ class SprayerBoom(Node):
         self._main_set = Actuator(0.0, 0, retry_ns=None)
         self._dis_set = Actuator(0.0, 0, retry_ns=None)
         self._lost = self._manual = self._babbles = False
+        self._gated.clear()
         self._wrong = ""
         self._counter = 0
 
@@ -297,6 +304,7 @@ class SprayerBoom(Node):
                 self._mode.jam(("Off",), statement.commands)
             case "", "manual":
                 self._manual = True
+                self._gated = {"SPRAYER_CMD", "SPRAYER_BOOM_CMD"}
             case "", "wrong counter" | "wrong checksum":
                 self._wrong = statement.action
             case "", "babbling":

@@ -8,9 +8,9 @@ dose and speed. `section[7] on` opens one without any map.
 Boom and spraying wait for each other: it sprays with the boom open only, and folds it when nothing is sprayed.
 
 The rule of the two senders: while an alarm in SPRAYER_ALARMS reads Repairing or LockedOut, it does not send the message that this
-alarm's repair holds; the others it sends on. A lock-out withdraws the order to spray: somebody has to order it anew. Sections are
-different: no repair holds the pattern. A section that is locked out is left out of it, and when its alarm reads Normal or Active
-again, the section is told to follow.
+alarm's repair holds; the others it sends on. A lock-out withdraws the order to spray: somebody has to order it anew, and so does
+the hand panel. Sections are different: no repair holds the pattern, so that an order to stop always closes them. A section that is
+locked out is left out of it, and when its alarm reads Normal or Active again, the section is told to follow.
 """
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from typing import ClassVar
 
 from firmware_py.codec import Codec, Value
 from firmware_py.fault import WORKS, Phrase, Statement
-from firmware_py.field import CELL_M, WeedMap, to_metres
+from firmware_py.field import CELL_M, paper_map, to_metres
 from firmware_py.node import COMMON_FAULTS, Node
 from firmware_py.quantity import Setting
 from firmware_py.sprayer_plant import SECTIONS
@@ -52,7 +52,7 @@ WIDTH_M = SECTIONS * CELL_M
 class SprayerMission(Node):
     """The node. Takes `ORDERS` by `order`. held: commands that level 1 holds, by the alarm that does."""
 
-    TICK_NS: ClassVar[int] = 50_000_000
+    TICK_NS: ClassVar[int] = 100_000_000
     DBC: ClassVar[str] = "sprayer_boom.dbc"
     MORE_DBC: ClassVar[tuple[str, ...]] = ("isobus_tractor.dbc",)
     DBC_NODE: ClassVar[str] = "MISSION"
@@ -88,7 +88,7 @@ class SprayerMission(Node):
         self._dose_l_ha, self._herbicide = chosen["dose"], chosen["herbicide"] / 100
         self._assumed_m_s = chosen["speed"] / 3.6
         self._lookahead_s, self._behind_m = chosen["lookahead"], chosen["boom_behind"]
-        self._map = WeedMap()
+        self._map = paper_map()
         self.held: dict[str, str] = {}
         self._obedient = True
         self._boom = "Stop"
@@ -130,6 +130,9 @@ class SprayerMission(Node):
         """Status, alarms, or where the tractor is."""
         match message:
             case "SPRAYER_STATUS":
+                if values["Control"] == "Manual" and (self._spraying or self._boom != "Stop"):
+                    self._spraying, self._boom = False, "Stop"
+                    self.tell(t_ns, "someone has the hand panel: boom and spraying have to be ordered anew")
                 self._status = values
             case "SPRAYER_ALARMS":
                 if values != self._alarms:
@@ -165,7 +168,7 @@ class SprayerMission(Node):
     # --- what it says -----------------------------------------------------------------------------------------------------
 
     def tick(self, t_ns: int) -> None:
-        """One tick of 50 ms: the flow that dose and speed need."""
+        """One tick of 100 ms: the flow that dose and speed need."""
         speed_m_s = self._assumed_m_s if self._speed_m_s is None else self._speed_m_s
         needed_l_min = self._dose_l_ha * self._dose * WIDTH_M * speed_m_s * 60 / 10_000 if self._spraying else 0.0
         if abs(needed_l_min - self._main_l_min) > FLOW_PLAY_L_MIN or not needed_l_min:

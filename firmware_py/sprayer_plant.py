@@ -26,16 +26,21 @@ STALL_S = 2.0
 
 
 class Boom:
-    """The folding. opening: 0 folded … 1 unfolded. time_s: from one end to the other. slow: takes three times as long."""
+    """The folding. opening: 0 folded … 1 unfolded. time_s: from one end to the other. slow: takes three times as long.
+
+    After it has given up (a resistance, a drive that did not obey) it moves for a new command, or while it is held to run.
+    """
 
     def __init__(self, opening: float, time_s: float):
         self.opening = opening
         self.slow = False
-        self._time_s = time_s
         self.drive = Actuator("Stop", BOOM_DRIVE_NS, retry_ns=None)
+        self._time_s = time_s
+        self._wanted = "Stop"
         self._blocked = False
         self._tries: int | None = None
         self._stalled_s = 0.0
+        self._held_only = False
 
     @property
     def state(self) -> str:
@@ -61,7 +66,10 @@ class Boom:
         self.drive.release()
 
     def again(self, now_ns: int) -> None:
-        """Drive once more."""
+        """Hold to run, if it has given up: drive once more, while `advance` is told `held`."""
+        if self._stalled_s < STALL_S and self.drive.position == self._wanted:
+            return
+        self._held_only = True
         if self._stalled_s >= STALL_S:
             self._stalled_s = 0.0
             if self._blocked and self._tries is not None:
@@ -69,12 +77,15 @@ class Boom:
                 self._blocked = self._tries > 0
         self.drive.again(now_ns)
 
-    def advance(self, now_ns: int, wanted: str, dt_s: float) -> None:
-        """One tick. wanted: Stop, Open or Close."""
-        before = self.drive.position
+    def advance(self, now_ns: int, wanted: str, dt_s: float, *, held: bool = False) -> None:
+        """One tick. wanted: Stop, Open or Close. held: somebody holds it to run."""
+        before, self._wanted = self.drive.position, wanted
         self.drive.advance(now_ns, wanted)
         if self.drive.position != before:
             self._stalled_s = 0.0
+        if self._held_only and not held:
+            self._held_only = False
+            self._stalled_s = STALL_S if self._moves else self._stalled_s
         if not self._moves:
             return
         if self._blocked:
@@ -93,7 +104,7 @@ HIGHEST_BAR = 10.0
 """The regulating valve sets no more."""
 REGULATOR_S = 0.8
 METER_S = 0.2
-LEAK_L_MIN = 10.0
+LEAK_L_MIN = 20.0
 
 
 class WaterLine:
@@ -177,7 +188,7 @@ class HerbicideLine:
 # --- tanks ------------------------------------------------------------------------------------------------------------------
 
 SLOSH_L, SLOSH_S = 1.0, 1.4
-DRIFT_L_S = 10.0 / 60
+DRIFT_L_S = 20.0 / 60
 
 
 class Tank:
