@@ -18,15 +18,16 @@ paused from above. A repair that is not armed runs passive: it reports once for 
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol
 
 from level1.alarm import AlarmMachine
 from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Repair
 from level1.condition import Verdict, Zone
 from level1.event import PRIORITIES, SentFrame
-from level1.expression import ExpectStep, ResendStep, SendStep, Step, WaitStep
+from level1.expression import ExpectStep, ResendStep, SendStep, WaitStep
 from level1.gate import Refused
+from level1.holds import Holds
 from level1.timer import FAR, Timers
 
 
@@ -43,24 +44,6 @@ class Host(Protocol):
     def forbidden(self, repair: Repair) -> str:
         """Why no repair of this kind may act now (stopped, paused from above); empty when it may."""
 
-    def claim(self, owner: RepairMachine, t_ns: int, messages: Sequence[str]) -> str:
-        """Own these command messages; gives the name of the alarm that keeps one, else an empty string."""
-
-    def release(self, owner: RepairMachine, t_ns: int, but: Sequence[str] = ()) -> None:
-        """Hand owned messages back, but not these."""
-
-    def is_cyclic(self, message: str) -> bool:
-        """Whether a command is sent again and again."""
-
-    def transmit(self, owner: RepairMachine, t_ns: int, step: SendStep | ResendStep) -> None:
-        """Send a step's frame and go on repeating it. Raises gate.Refused."""
-
-    def restore_commands(self, owner: RepairMachine, t_ns: int) -> None:
-        """Return its messages to what was commanded before the episode."""
-
-    def preview(self, owner: RepairMachine, steps: Sequence[Step]) -> tuple[SentFrame, ...]:
-        """The frames that these steps send."""
-
 
 IDLE, RUNNING, PAUSING, WAITING = range(4)
 
@@ -72,14 +55,15 @@ class RepairMachine:
     expects: a closure with the verdict for each expect step; feedback(): worst verdict of all of them, unknown or not.
     """
 
-    __slots__ = ("alarm", "attempt", "begun_ns", "definition", "due", "expects", "feedback", "host", "order", "phase", "position",
-                 "reported", "timers")
+    __slots__ = ("alarm", "attempt", "begun_ns", "definition", "due", "expects", "feedback", "holds", "host", "order",
+                 "phase", "position", "reported", "timers")
 
-    def __init__(self, alarm: AlarmMachine, definition: Repair, host: Host, timers: Timers,
+    def __init__(self, alarm: AlarmMachine, definition: Repair, host: Host, holds: Holds, timers: Timers,
                  expects: dict[int, Callable[[], int]], feedback: Callable[[], int]):
         self.alarm = alarm
         self.definition = definition
         self.host = host
+        self.holds = holds
         self.timers = timers
         self.order = timers.order()
         self.due = FAR
@@ -90,6 +74,11 @@ class RepairMachine:
         self.attempt = 0
         self.begun_ns: list[int] = []
         self.reported = False
+
+    @property
+    def name(self) -> str:
+        """Of its alarm."""
+        return self.alarm.definition.name
 
     @property
     def rank(self) -> int:
@@ -105,7 +94,7 @@ class RepairMachine:
     @property
     def lasting(self) -> list[str]:
         """Those of them that a lock-out goes on holding; a command sent once leaves nothing to hold."""
-        return [message for message in self.messages if self.host.is_cyclic(message)]
+        return [message for message in self.messages if self.holds.is_cyclic(message)]
 
     # --- what can happen to it --------------------------------------------------------------------------------------------
 
@@ -170,7 +159,7 @@ class RepairMachine:
         self.phase = IDLE
         self.attempt = 0
         self.reported = False
-        self.host.release(self, t_ns)
+        self.holds.release(self, t_ns)
 
     def restore(self, t_ns: int, attempt: int, begun_ns: list[int]) -> None:
         """Go on after a restart of the program: an attempt that was under way has failed, a lock-out is still one."""
@@ -179,7 +168,7 @@ class RepairMachine:
         if self.alarm.state == LOCKED_OUT:
             self._hold_safe_state(t_ns)
         elif self.alarm.state == REPAIRING:
-            self.host.claim(self, t_ns, self.messages)
+            self.holds.claim(self, t_ns, self.messages)
             self.fail(t_ns, "the supervisor was restarted during the attempt")
 
     # --- what it does -----------------------------------------------------------------------------------------------------
@@ -200,7 +189,7 @@ class RepairMachine:
             self.lock_out(t_ns, "as many attempts as the budget allows were made lately")
             return
         self.phase = WAITING
-        if self.feedback() or self.host.forbidden(self.definition) or self.host.claim(self, t_ns, self.messages):
+        if self.feedback() or self.host.forbidden(self.definition) or self.holds.claim(self, t_ns, self.messages):
             return
         self._start(t_ns)
 
@@ -214,7 +203,7 @@ class RepairMachine:
         self.position = 0
         self.attempt += 1
         self.begun_ns.append(t_ns)
-        frames = self.host.preview(self, self.definition.steps)
+        frames = self.holds.preview(self.definition.steps)
         self.host.emit(self.alarm, t_ns, "repair_started", self.definition.text, self.attempt, frames)
         self.alarm.enter(t_ns, REPAIRING)
         self.run(t_ns)
@@ -239,7 +228,7 @@ class RepairMachine:
 
     def _transmit(self, t_ns: int, step: SendStep | ResendStep) -> bool:
         try:
-            self.host.transmit(self, t_ns, step)
+            self.holds.transmit(self, t_ns, step)
         except Refused as refusal:
             self.fail(t_ns, str(refusal))
             return False
@@ -255,7 +244,7 @@ class RepairMachine:
     def _end(self, t_ns: int) -> None:
         self.phase = IDLE
         self.due = FAR
-        self.host.release(self, t_ns)
+        self.holds.release(self, t_ns)
         self.alarm.enter(t_ns, ACTIVE)
         self.alarm.try_clear(t_ns)
 
@@ -268,7 +257,7 @@ class RepairMachine:
         if self.definition.safe_between:
             self._safe_state(t_ns)
         else:
-            self.host.restore_commands(self, t_ns)
+            self.holds.restore(self, t_ns)
         self.phase = PAUSING
         if self.definition.pause_ns:
             self.timers.set(self, t_ns + self.definition.pause_ns)
@@ -286,22 +275,22 @@ class RepairMachine:
         self.host.emit(self.alarm, t_ns, "locked_out", why, self.attempt)
         self.alarm.enter(t_ns, LOCKED_OUT)
         self._hold_safe_state(t_ns)
-        self.host.release(self, t_ns, self.lasting)
+        self.holds.release(self, t_ns, self.lasting)
 
     def _hold_safe_state(self, t_ns: int) -> None:
-        self.host.claim(self, t_ns, self.lasting)
+        self.holds.claim(self, t_ns, self.lasting)
         self._safe_state(t_ns)
 
     def _safe_state(self, t_ns: int) -> None:
         for step in self.definition.give_up:
             if isinstance(step, (SendStep, ResendStep)):
                 try:
-                    self.host.transmit(self, t_ns, step)
+                    self.holds.transmit(self, t_ns, step)
                 except Refused:
                     continue
 
     def _report_passive(self, t_ns: int) -> None:
         if not self.reported:
             self.reported = True
-            frames = self.host.preview(self, self.definition.steps)
+            frames = self.holds.preview(self.definition.steps)
             self.host.emit(self.alarm, t_ns, "repair_started", self.definition.text, 1, frames, passive=True)

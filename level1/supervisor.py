@@ -12,48 +12,32 @@ from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 from itertools import chain
 from typing import Any
-from zlib import crc32
-
-import msgspec
 
 from level1.alarm import AlarmMachine
 from level1.board import ALWAYS, Board, Cell, Page, Tap, Watch
 from level1.canopen import DEVICE_EMERGENCY, DEVICE_SILENT, NMT, Device, Devices
-from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Alarm, Catalog, Command, Message, Repair
+from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Catalog, Command, Message, Repair
 from level1.command import Order
 from level1.condition import Compiler, Things, Thresholds, Verdict, Zone, walk
-from level1.decode import GOOD, QUALITY_WORDS, RawValue, encode
+from level1.decode import GOOD, QUALITY_WORDS, encode
 from level1.event import PRIORITIES, Event, Monitor, Output, Result, Send, SentFrame, seconds
 from level1.expression import (
-    AlarmState,
-    Count,
-    Elapsed,
     ExpectStep,
     Expression,
     Quality,
-    Rate,
     ResendStep,
     SendStep,
     SignalValue,
-    Silent,
-    Step,
 )
-from level1.frame import BUS_SHIFT, EXTENDED, Frame, frame_key
+from level1.frame import Frame, frame_key
+from level1.freeze_frame import freeze_frame, physical
 from level1.gate import Gate, Refused
-from level1.j1939 import DM1, FMI_WORDS, TP_CM, TP_DT, Transport, TroubleCodeReport, parse_dm1
-from level1.j1939_node import ADDRESS_CLAIMED, REQUEST, Node, name_of
+from level1.holds import Holds
+from level1.memory import AlarmMemory, State
 from level1.repair import RepairMachine
+from level1.subsystems import TROUBLE_CODE, Subsystems
 from level1.timer import FAR, Timed, Timers
 
-STATE_WORDS = ("Normal", "Active", "Repairing", "LockedOut")
-TROUBLE_CODE = "TroubleCode"
-"""Alarm of `ucs.dbc` whose causes are the active trouble codes of all senders."""
-ADDRESS_CONFLICT = "AddressConflict"
-"""Alarm of `ucs.dbc`: another node claims or uses the address of the UCS."""
-SECOND_TALKER = "SecondTalker"
-"""Alarm of `ucs.dbc`: someone else sends a message that is the UCS's own."""
-PROTOCOL_LIFE_NS = 100_000_000
-"""A frame of a protocol is worthless after this."""
 UNTOLD = -1
 """Outcome of a condition before its first evaluation: whatever it is then, its alarm is told."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -61,32 +45,6 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 MAX_INSTANCES = 256
 """Causes at one time of an alarm that subsystems report; more are counted, not kept: a babbling node must not fill the memory."""
-
-
-class AlarmMemory(msgspec.Struct, frozen=True):
-    """What survives a restart of one alarm, or of one reported cause of it.
-
-    begun_ago_ns, raised_ago_ns: ages of attempts and activations when it was stored.
-    """
-
-    name: str
-    state: int
-    instance: int
-    acknowledged: bool
-    attempt: int
-    begun_ago_ns: tuple[int, ...]
-    raised_ago_ns: tuple[int, ...]
-    key: str = ""
-    detail: dict[str, Any] = {}
-    text: str = ""
-
-
-class State(msgspec.Struct, frozen=True):
-    """What survives a restart: latches, lock-outs, budgets, activations, the mode ordered from above. No time stamps: the
-    monotonic time line begins anew; time spent switched off does not count, which keeps budgets on the strict side."""
-
-    mode: str
-    alarms: tuple[AlarmMemory, ...]
 
 
 class Supervisor:
@@ -117,7 +75,6 @@ class Supervisor:
         self.timers = Timers()
         self.board = Board(catalog, self.timers)
         self.counters = self.board.counters
-        self.transport: Transport | None = None
         self.now_ns = start_ns if start_ns is not None else -FAR
         self._begun = False
         self._restored = restored
@@ -125,26 +82,22 @@ class Supervisor:
         self._things = Things()
         self._alarms = {name: AlarmMachine(alarm, self, self.timers) for name, alarm in catalog.alarms.items()}
         self._reported: dict[str, dict[str, AlarmMachine]] = {name: {} for name in catalog.alarms}
-        self._codes: dict[int, dict[str, TroubleCodeReport]] = {}
         self._raised: dict[str, deque[int]] = {}
         self._activations: Counter[str] = Counter()
         self._counts: list[_Window] = []
-        self._holds: dict[str, _Hold] = {}
+        self.holds = Holds(catalog, self.board, self.timers, self.send, self._circumstances_changed, self.counters)
         self._inputs: dict[str, list[tuple[str, Callable[[int], Any]]]] = {}
         self._watches: list[Watch] = []
         self._repairs: dict[str, RepairMachine] = {}
-        self._nodes = {bus: self._node(bus, address) for bus, address in (j1939 or {}).items()}
         self._devices = Devices(catalog, devices, self, self.timers, self.counters) \
             if DEVICE_EMERGENCY in self._alarms or DEVICE_SILENT in self._alarms else None
-        self._compile()
+        self._compile(j1939 or {})
         self._broadcasts = self._make_broadcasts() if broadcast else {}
         self._samplers = self._make_samplers(monitor_ns) if monitor_ns else []
         self.gate = Gate(catalog, self.sendable(), frozenset(readings))
-        self._heard_ns = self.now_ns
-        self._own_keys = frozenset(
+        self.subsystems.own_keys = frozenset(
             frame_key(message.can_id, message.extended, bus) for name in self._broadcasts
             for message in (catalog.messages[name],) if message.senders == ("UCS",) for bus in catalog.buses.get(name, (0,)))
-        self.board.newcomer = self._newcomer
 
     # --- inputs -----------------------------------------------------------------------------------------------------------
 
@@ -300,7 +253,7 @@ class Supervisor:
 
     def meet(self, t_ns: int, key: int) -> Page | Tap | None:
         """The page of an identifier heard for the first time, or again for the first time since its page fell silent."""
-        self._heard_ns = t_ns
+        self.subsystems.heard_ns = t_ns
         return self.board.bind(key)
 
     def take(self, now_ns: int) -> list[Output]:
@@ -348,8 +301,7 @@ class Supervisor:
         everything.watches = self._watches
         self.board.queue(everything)
         self.board.settle(start)
-        for node in self._nodes.values():
-            node.start(start)
+        self.subsystems.start(start)
         if self._devices is not None:
             self._devices.start(start)
         cyclic: list[Timed] = [*self._broadcasts.values(), *self._samplers]
@@ -366,7 +318,7 @@ class Supervisor:
 
     # --- building ---------------------------------------------------------------------------------------------------------
 
-    def _compile(self) -> None:
+    def _compile(self, addresses: Mapping[int, int]) -> None:
         board, things = self.board, self._things
         thresholds = Thresholds(board, things)
         for expression in self._expressions():
@@ -379,81 +331,18 @@ class Supervisor:
             alarm = machine.definition
             evaluate, cells = compiler.zone(alarm.when, alarm.until, alarm.enabled)
             self._watch(evaluate, cells, machine.zone_changed, UNTOLD)
-            self._inputs[name] = self._freeze_frame(alarm)
+            self._inputs[name] = freeze_frame(alarm, board, things, self._alarms)
             if alarm.repair is not None:
                 self._compile_repair(machine, alarm.repair, compiler)
         for (name, window_ns), cell in things.counts.items():
             self._raised.setdefault(name, deque())
             self._counts.append(_Window(self, name, window_ns, cell))
-        if TROUBLE_CODE in self._alarms or things.codes or self._nodes:
-            self.transport = Transport(board.deliver, self.counters)
-            self._listen(self.transport)
+        self.subsystems = Subsystems(self, board, things, self.timers, self.counters, unit=self.unit, addresses=addresses,
+                                     wanted=TROUBLE_CODE in self._alarms or bool(things.codes))
         if self._devices is not None:
             for can_id, listener in self._devices.listeners().items():
                 board.listen_to(can_id, listener)
         board.compile()
-
-    def _listen(self, transport: Transport) -> None:
-        """Hear what J1939 says beyond single frames, and let the own node answer where there is one."""
-        def answered(answer: Callable[[Node, int, int, bytes], None],
-                     listen: Callable[[int, int, bytes], None] | None = None) -> Callable[[int, int, bytes], None]:
-            def listener(t_ns: int, key: int, data: bytes) -> None:
-                if listen is not None:
-                    listen(t_ns, key, data)
-                node = self._nodes.get(key >> BUS_SHIFT)
-                if node is not None:
-                    answer(node, t_ns, key, data)
-            return listener
-        self.board.listen(DM1, self._diagnosed)
-        self.board.listen(TP_CM, answered(Node.connection, transport.connection))
-        self.board.listen(TP_DT, answered(Node.packet, transport.packet))
-        if self._nodes:
-            self.board.listen(ADDRESS_CLAIMED, answered(Node.claimed))
-            self.board.listen(REQUEST, answered(Node.requested))
-
-    def _node(self, bus: int, address: int) -> Node:
-        def transmit(t_ns: int, key: int, data: bytes, what: str) -> None:
-            self._out.append(Send(t_ns, key, data, what, "J1939", t_ns + PROTOCOL_LIFE_NS))
-
-        def conflict(t_ns: int, contested: int, name: bytes | None) -> None:
-            other = name.hex().upper() if name else "unknown"
-            self.report(t_ns, ADDRESS_CONFLICT, str(bus), name is not None, {"SourceAddress": contested, "Bus": bus, "Name": other},
-                        f"another node {'claims' if name else 'uses'} source address {contested}")
-        return Node(bus, name_of(crc32(self.unit.encode())), address, self.timers, transmit, conflict)
-
-    def _newcomer(self, key: int) -> None:
-        """An identifier is heard for the first time: is it one that only this node may send?"""
-        if key in self._own_keys:
-            self.report(self._heard_ns, SECOND_TALKER, f"{key:X}", True, {"Id": f"{key & 0x1FFF_FFFF:X}", "Bus": key >> BUS_SHIFT},
-                        f"someone else sends the message with identifier {key & 0x1FFF_FFFF:X}")
-        node = self._nodes.get(key >> BUS_SHIFT)
-        if node is not None and key & EXTENDED and key >> 8 & 0x3FF00 != ADDRESS_CLAIMED:
-            node.used(self._heard_ns, key)
-
-    def _diagnosed(self, t_ns: int, key: int, data: bytes) -> None:
-        """A DM1: trouble codes appear and vanish."""
-        diagnosis = parse_dm1(data)
-        if diagnosis is None:
-            self.counters["trouble code messages cut short"] += 1
-            return
-        source, bus = key & 0xFF, key >> BUS_SHIFT
-        sender = bus << 8 | source
-        before = self._codes.get(sender, {})
-        now = {f"{bus}/{source}/{code.spn}/{code.fmi}": code for code in diagnosis.codes}
-        for name in before.keys() - now.keys():
-            self.report(t_ns, TROUBLE_CODE, name, False, {}, "")
-        for name, code in now.items():
-            detail = {"SourceAddress": source, "SPN": code.spn, "FMI": code.fmi, "Occurrences": code.occurrences,
-                      "Lamps": " ".join(diagnosis.lamps), "Bus": bus}
-            text = f"SPN {code.spn} {FMI_WORDS[code.fmi]}, from source address {source}"
-            self.report(t_ns, TROUBLE_CODE, name, True, detail, text)
-        self._codes[sender] = now
-        active = {(code.spn, code.fmi) for codes in self._codes.values() for code in codes.values()}
-        for (spn, fmi), cell in self._things.codes.items():
-            k = int(any(one == spn and fmi in (None, two) for one, two in active))
-            if cell.k != k:
-                cell.k = k
-                self.board.queue(cell)
 
     def _expressions(self) -> Iterable[Expression]:
         for alarm in self.catalog.alarms.values():
@@ -498,32 +387,11 @@ class Supervisor:
             """The worst unknown among the expectations, 0 when all are known."""
             return max((verdict for verdict in (ask() for ask in verdicts) if verdict > Verdict.TRUE), default=0)
 
-        episode = RepairMachine(machine, repair, self, self.timers, expects, feedback)
+        episode = RepairMachine(machine, repair, self, self.holds, self.timers, expects, feedback)
         self._repairs[machine.definition.name] = machine.episode = episode
         self._watch(feedback, dict.fromkeys(cell for _, cells in compiled.values() for cell in cells), episode.feedback_changed, 0)
         for position, (evaluate, cells) in compiled.items():
             self._watch(evaluate, cells, _expectation(episode, position), Verdict.FALSE)
-
-    def _freeze_frame(self, alarm: Alarm) -> list[tuple[str, Callable[[int], Any]]]:
-        """What to record with every event of an alarm: the inputs of its condition and of what enables it, by name."""
-        inputs: dict[str, Callable[[int], Any]] = {}
-        for node in chain(walk(alarm.when), walk(alarm.enabled)):
-            match node:
-                case SignalValue(message=message, signal=signal) | Rate(message=message, signal=signal):
-                    cell = self.board.cell(message, signal)
-                    inputs[cell.name] = _reader(self.board, cell)
-                case Quality(message=message, signal=signal) | Elapsed(message=message, signal=signal) if signal:
-                    cell = self.board.cell(message, signal)
-                    inputs[cell.name] = _reader(self.board, cell)
-                case Silent(message=message) | Quality(message=message) | Elapsed(message=message):
-                    inputs[message] = _silence(self.board, self.board.page(message))
-                case AlarmState(alarm=other):
-                    inputs[other] = _state_word(self._alarms[other])
-                case Count(alarm=other, window_ns=window):
-                    inputs[f"count({other})"] = _count(self._things.count(other, window))
-                case _:
-                    pass
-        return list(inputs.items())
 
     def _make_broadcasts(self) -> dict[str, _Broadcast]:
         names = dict.fromkeys(alarm.message for alarm in self.catalog.alarms.values())
@@ -546,6 +414,10 @@ class Supervisor:
             definition.priority, event, self.seq if event == "raised" else alarm.instance, attempt, values, text, frames, passive))
         return self.seq
 
+    def hand_out(self, send: Send) -> None:
+        """A frame of a protocol, which no definition names."""
+        self._out.append(send)
+
     def utc(self, t_ns: int) -> str | None:
         """RFC 3339 label of a time, None where no wall clock is known."""
         if self.utc_offset_ns is None:
@@ -561,8 +433,8 @@ class Supervisor:
         if cell is not None:
             cell.k = self.bus_state(alarm.definition.name)
             self.board.queue(cell)
-        for node in self._nodes.values():
-            node.report(t_ns, *self._own_codes())
+        if self.subsystems.speaks:
+            self.subsystems.report(t_ns, *self._own_codes())
         broadcast = self._broadcasts.get(alarm.definition.message)
         if broadcast is not None:
             broadcast.expire(t_ns)
@@ -592,76 +464,6 @@ class Supervisor:
         """Nothing moves while the unit is stopped or paused from above."""
         return f"the unit is {self.mode} from above" if repair.moves and self.mode != "running" else ""
 
-    def claim(self, owner: RepairMachine, t_ns: int, messages: Sequence[str]) -> str:
-        """Own command messages, all or none; from a repair of lower priority they are taken."""
-        holds = [self._hold(name) for name in messages]
-        for hold in holds:
-            if hold.owner not in (None, owner) and hold.owner is not None and hold.owner.rank >= owner.rank:
-                return hold.owner.alarm.definition.name
-        for hold in holds:
-            if hold.owner is not None and hold.owner is not owner:
-                hold.owner.taken(t_ns, owner.alarm.definition.name)
-                hold.payload = b""
-            if hold.owner is not owner:
-                hold.before = self._last_command(hold.message.name)
-            hold.owner = owner
-        return ""
-
-    def restore_commands(self, owner: RepairMachine, t_ns: int) -> None:
-        """Return a repair's messages to what was commanded before the episode, where anyone did."""
-        for hold in self._holds.values():
-            if hold.owner is owner and hold.before is not None:
-                hold.payload = hold.before
-                self._repeat(hold, t_ns)
-
-    def _repeat(self, hold: _Hold, t_ns: int) -> None:
-        if hold.owner is None:
-            return
-        try:
-            self.send(t_ns, hold.message.name, hold.payload, f"held by the repair of {hold.owner.alarm.definition.name}")
-        except Refused:
-            self.counters["frames refused by the gate"] += 1
-        if hold.message.cycle_ns:
-            self.timers.set(hold, t_ns + hold.message.cycle_ns)
-
-    def is_cyclic(self, message: str) -> bool:
-        """Whether a command has a cycle time."""
-        return bool(self.catalog.messages[message].cycle_ns)
-
-    def release(self, owner: RepairMachine, t_ns: int, but: Sequence[str] = ()) -> None:
-        """Hand command messages back, but not these, and let those who wait for one try again."""
-        freed = [hold for hold in self._holds.values() if hold.owner is owner and hold.message.name not in but]
-        for hold in freed:
-            hold.owner = None
-            hold.payload = b""
-            hold.due = FAR
-        if freed:
-            self._circumstances_changed(t_ns)
-
-    def transmit(self, owner: RepairMachine, t_ns: int, step: SendStep | ResendStep) -> None:
-        """Send a step's frame now, and go on repeating it at its cycle time while the episode lasts. Raises Refused."""
-        hold = self._hold(step.message)
-        payload = self._payload(step, hold.payload if hold.owner is owner and hold.payload else self._last_command(step.message))
-        self.send(t_ns, step.message, payload, f"repair of {owner.alarm.definition.name}")
-        hold.payload = payload
-        if hold.message.cycle_ns:
-            self.timers.set(hold, t_ns + hold.message.cycle_ns)
-
-    def preview(self, owner: RepairMachine, steps: Sequence[Step]) -> tuple[SentFrame, ...]:
-        """The frames that steps would send from here, one after the other."""
-        frames = []
-        payloads: dict[str, bytes] = {}
-        for step in steps:
-            if isinstance(step, (SendStep, ResendStep)):
-                message = self.catalog.messages[step.message]
-                base = payloads.get(step.message, self._last_command(step.message))
-                if isinstance(step, SendStep):
-                    base = encode(message, step.values, base)
-                if base is not None:
-                    payloads[step.message] = base
-                    frames.append(SentFrame(step.message, f"{message.can_id:0{8 if message.extended else 3}X}", base.hex().upper()))
-        return tuple(frames)
-
     # --- sending ----------------------------------------------------------------------------------------------------------
 
     def send(self, t_ns: int, name: str, payload: bytes, reason: str) -> None:
@@ -676,26 +478,6 @@ class Supervisor:
         page = self.board.pages.get(name)
         if page is not None:
             page.receive(t_ns, payload)
-
-    def _hold(self, name: str) -> _Hold:
-        if name not in self._holds:
-            self._holds[name] = _Hold(self, self.catalog.messages[name])
-        return self._holds[name]
-
-    def _last_command(self, name: str) -> bytes | None:
-        """The payload last commanded by whomever, as long as it still counts; None: nobody commands this now."""
-        page = self.board.page(name)
-        if page.level < 0 or (page.stale_level and page.level >= page.stale_level) or len(page.data) != page.message.length:
-            return None
-        return page.data
-
-    def _payload(self, step: SendStep | ResendStep, last: bytes | None) -> bytes:
-        """What a step sends, given what was commanded last: by this repair while it owns the message, whatever others send then."""
-        if isinstance(step, SendStep):
-            return encode(self.catalog.messages[step.message], step.values, last)
-        if last is None:
-            raise Refused(f"nobody has commanded {step.message} lately: there is nothing to send again")
-        return last
 
     # --- commands ---------------------------------------------------------------------------------------------------------
 
@@ -740,9 +522,9 @@ class Supervisor:
 
     def _command_payload(self, command: Command, order: Order) -> bytes:
         message = self.catalog.messages[command.message]
-        hold = self._holds.get(command.message)
-        if hold is not None and hold.owner is not None:
-            raise Refused(f"{command.message} belongs to the repair of {hold.owner.alarm.definition.name} now")
+        owner = self.holds.owner(command.message)
+        if owner is not None:
+            raise Refused(f"{command.message} belongs to the repair of {owner.name} now")
         raws: dict[str, int] = {}
         for name, raw in command.values.items():
             if raw is not None:
@@ -753,7 +535,7 @@ class Supervisor:
             signal = message.signal(name)
             exact = (Fraction(order.value) - Fraction(signal.offset)) / Fraction(signal.factor)
             raws[name] = round(exact)
-        return encode(message, raws, self._last_command(command.message))
+        return encode(message, raws, self.holds.last_command(command.message))
 
     def _circumstances_changed(self, t_ns: int) -> None:
         ranked = sorted(self._repairs.values(), key=lambda repair: -repair.rank)
@@ -826,23 +608,6 @@ class _Window:
             supervisor.timers.set(self, inside[0] + self.window_ns)
 
 
-class _Hold:
-    """A command message while a repair owns it: repeated at its cycle time."""
-
-    def __init__(self, supervisor: Supervisor, message: Message):
-        self.supervisor = supervisor
-        self.message = message
-        self.order = supervisor.timers.order()
-        self.due = FAR
-        self.owner: RepairMachine | None = None
-        self.payload = b""
-        self.before: bytes | None = None
-
-    def expire(self, now_ns: int) -> None:
-        """Repeat it."""
-        self.supervisor._repeat(self, now_ns)
-
-
 class _Broadcast:
     """An alarm message on the bus: at every change and at its cycle time."""
 
@@ -890,39 +655,6 @@ class _Sampler:
         supervisor._out.append(Monitor(supervisor.unit, supervisor.boot, seconds(now_ns), supervisor.utc(now_ns),
                                        supervisor.utc_trusted, self.message.monitor_as, values, ages, quality))
         supervisor.timers.set(self, now_ns + self.period_ns)
-
-
-def physical(cell: Cell, raw: RawValue) -> int | float | str:
-    """A raw value for people: its name in the value table, else the physical value."""
-    if isinstance(raw, int) and raw in cell.signal.choices:
-        return cell.signal.choices[raw]
-    return cell.scale.physical(raw)
-
-
-def _reader(board: Board, cell: Cell) -> Callable[[int], Any]:
-    def read(t_ns: int) -> Any:
-        raw, quality = board.sample(cell)
-        return physical(cell, raw) if quality == GOOD and raw is not None else QUALITY_WORDS[quality]
-    return read
-
-
-def _silence(board: Board, page: Page) -> Callable[[int], Any]:
-    def read(t_ns: int) -> Any:
-        board.refresh(page)
-        return "never" if page.level < 0 else f"last received {(t_ns - page.t_ns) / 1e9:.3f} s ago"
-    return read
-
-
-def _state_word(machine: AlarmMachine) -> Callable[[int], Any]:
-    def read(t_ns: int) -> Any:
-        return STATE_WORDS[machine.state]
-    return read
-
-
-def _count(cell: Cell) -> Callable[[int], Any]:
-    def read(t_ns: int) -> Any:
-        return cell.value
-    return read
 
 
 def _expectation(episode: RepairMachine, position: int) -> Callable[[int, int], None]:

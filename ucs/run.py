@@ -21,7 +21,8 @@ from level1.io.error import OutsideError
 from level1.io.inbox import Inbox
 from level1.io.journal import Journal
 from level1.io.live import Live, decode_state
-from level1.supervisor import State, Supervisor
+from level1.memory import State
+from level1.supervisor import Supervisor
 from ucs import readings
 from ucs.printer import Printer
 from ucs.render import clock, event_line, painted, wants_colour

@@ -30,7 +30,7 @@ from level1.expression import (
     TroubleCode,
     WaitStep,
 )
-from level1.supervisor import STATE_WORDS
+from level1.freeze_frame import STATE_WORDS
 
 _OPERATORS: dict[Operator, str] = {
     "==": "is", "!=": "is not", "<": "is below", "<=": "is at most", ">": "is above", ">=": "is at least"}

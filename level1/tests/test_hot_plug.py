@@ -9,7 +9,8 @@ from level1.decode import encode
 from level1.definitions import Source, build
 from level1.event import Event, Result
 from level1.frame import Frame, frame_key
-from level1.supervisor import State, Supervisor
+from level1.memory import State
+from level1.supervisor import Supervisor
 
 MS, S = 1_000_000, 1_000_000_000
 PRESENT = "never({0}Coupled) or {0}Coupled == Yes or not silent({1}_STATUS, 1 s)"

@@ -50,16 +50,16 @@ def test_a_stronger_name_takes_the_address_and_the_conflict_is_told() -> None:
     outputs = list(target.receive(claim(100 * MS, 0x80, bytes(8))))
     assert [send.key & 0xFF for send in sent(outputs, 0xEE00)] == [0x81]
     assert [out.alarm for out in outputs if isinstance(out, Event)] == ["AddressConflict"]
-    assert target._nodes[0].address is None
+    assert target.subsystems._nodes[0].address is None
     cleared = target.tick(SECOND)
-    assert [out.event for out in cleared if isinstance(out, Event)] == ["cleared"] and target._nodes[0].address == 0x81
+    assert [out.event for out in cleared if isinstance(out, Event)] == ["cleared"] and target.subsystems._nodes[0].address == 0x81
 
 
 def test_a_weaker_name_is_sent_away() -> None:
     target = supervisor()
     target.tick(SECOND)
     outputs = list(target.receive(claim(SECOND, 0x80, b"\xff" * 8)))
-    assert [send.key & 0xFF for send in sent(outputs, 0xEE00)] == [0x80] and target._nodes[0].address == 0x80
+    assert [send.key & 0xFF for send in sent(outputs, 0xEE00)] == [0x80] and target.subsystems._nodes[0].address == 0x80
 
 
 def test_without_a_free_address_it_says_so_and_stays_silent() -> None:
