@@ -38,8 +38,8 @@ RETRY_S = 0.25
 RETRY_SEND_NS = 1_000_000
 WAITING_SENDS = 200
 """Frames that wait for an interface at most; the oldest is dropped first."""
-MOST_IDS = 4096
-"""Identifiers counted in a window."""
+MOST_FRAMES = 100_000
+"""Frames that are looked at in a window."""
 
 
 class Interface(Protocol):
@@ -260,7 +260,7 @@ class Port:
         if wire is not None and wire.impossible:
             self.counters["impossible"] += wire.impossible
             wire.impossible = 0
-        self._report(self.health.window(now_ns, Traffic(window.ids, window.span_ns(now_ns), lost, unsent, sent)))
+        self._report(self.health.window(now_ns, Traffic(window.ids(), window.span_ns(now_ns), lost, unsent, sent)))
         self._widen(window, traffic)
 
     def _widen(self, window: _Window, traffic: tuple[int, int] | None) -> None:
@@ -332,8 +332,7 @@ class _Window:
 
     def __init__(self, now_ns: int, before: _Window | None = None):
         self.begin_ns = now_ns
-        self.oldest_ns = self.newest_ns = now_ns
-        self.ids: Counter[int] = Counter()
+        self._batches: list[Sequence[Frame]] = []
         self.seen = 0
         self.sent = 0
         self.traffic: tuple[int, int] | None = None
@@ -344,14 +343,18 @@ class _Window:
         """Frames have come."""
         if not frames:
             return
-        self.oldest_ns, self.newest_ns = min(self.oldest_ns, frames[0][0]), max(self.newest_ns, frames[-1][0])
         self.seen += len(frames)
-        if len(self.ids) < MOST_IDS:
-            self.ids.update([frame[1] & 0xFFFF_FFFF for frame in frames])
+        if self.seen < MOST_FRAMES:
+            self._batches.append(frames)
+
+    def ids(self) -> Counter[int]:
+        """Frames by identifier."""
+        return Counter(frame[1] & 0xFFFF_FFFF for frames in self._batches for frame in frames)
 
     def span_ns(self, now_ns: int) -> int:
         """Time over which its frames came: of old ones that had to wait, longer than the window."""
-        return max(now_ns - self.begin_ns, self.newest_ns - self.oldest_ns)
+        came = self._batches[-1][-1][0] - self._batches[0][0][0] if self._batches else 0
+        return max(now_ns - self.begin_ns, came)
 
     def lost_until(self, lost: int | None) -> int:
         """Frames lost in this window, by the interface's count of all."""

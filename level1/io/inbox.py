@@ -96,10 +96,11 @@ class Inbox:
 
     def take(self) -> Load:
         """All that is there."""
-        if self._rung:
-            self._rung = False
-            with suppress(BlockingIOError):
-                os.eventfd_read(self._bell)
+        if not self._rung:
+            return Load([], [], [], [], 0)
+        self._rung = False
+        with suppress(BlockingIOError):
+            os.eventfd_read(self._bell)
         with self._lock:
             load = Load(list(self._frames), self._orders, self._reports, self._notices, self._dropped)
             self._frames.clear()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Sequence
+from operator import itemgetter
 from typing import Protocol
 
 import msgspec
@@ -26,17 +27,22 @@ from level1.io.host import clock_is_synchronised
 from level1.io.inbox import Inbox
 from level1.io.listening import listening
 from level1.j1939_node import ADDRESS_CLAIMED
-from level1.supervisor import State, Supervisor
+from level1.memory import State
+from level1.supervisor import Supervisor
 
 LAG_NS = 2_000_000
 """Deadlines are served so late, that a frame stamped before one, which its reader hands over a moment later, still counts."""
 LONGEST_WAIT_S = 1.0
-NAP_NS = 900_000
+NAP_NS = 1_000_000
+QUIET_NS = 50_000_000
+"""Where nothing comes out, journal and link are looked after so often."""
 LOSS_NS = 500_000_000
 """So long after the last lost frame the loss is over."""
 DROPPED = "UCS"
 """Key of the cause of `FramesLost` for frames of any bus that came faster than they were supervised."""
 TRUST_PERIOD_NS = 10_000_000_000
+_stamp = itemgetter(0)
+"""Time of a frame or a reading."""
 
 
 class EventStore(Protocol):
@@ -58,7 +64,8 @@ class Link(Protocol):
     """The way to the bridge process; never blocks. What it can't take is in the journal, or soon out of date."""
 
     def publish(self, events: Sequence[Event], outputs: Sequence[Monitor | Result]) -> None:
-        """Called at every turn: events that were just journaled, monitoring messages and answers to orders."""
+        """Called with what there is, and now and then with nothing: events that were just journaled, monitoring messages and
+        answers to orders."""
 
 
 class Tap(Protocol):
@@ -114,6 +121,7 @@ class Live:
         self._nap = nap
         self._busy = False
         self._turned_ns = clock()
+        self._delivered_ns = self._turned_ns - QUIET_NS
         self._missing = 0
         self._missing_ns: int | None = None
         self._addresses: dict[int, int] = {}
@@ -140,7 +148,7 @@ class Live:
         load = self.inbox.take()
         frames = load.frames
         for port in self.ports:
-            frames += port.fetch()
+            frames = frames + port.fetch() if frames else port.fetch()
         now_ns = self._turned_ns = self._clock()
         self._busy = bool(frames)
         self._label(now_ns)
@@ -157,8 +165,11 @@ class Live:
         deadline = self.supervisor.next_deadline()
         if deadline is not None and deadline <= self._served_ns:
             outputs.extend(self.supervisor.tick(self._served_ns))
-        outputs.extend(self._tell(load.reports, load.dropped, now_ns))
-        self._deliver(outputs)
+        if load.reports or load.dropped or self._missing or not self._begun:
+            outputs.extend(self._tell(load.reports, load.dropped, now_ns))
+        if outputs or self._retry_ns is not None or now_ns - self._delivered_ns >= QUIET_NS:
+            self._delivered_ns = now_ns
+            self._deliver(outputs)
 
     def _wait(self, patience_s: float) -> None:
         """Until something comes; on a busy bus until enough has come."""
@@ -310,7 +321,3 @@ def encode_state(state: State) -> bytes:
 def decode_state(stored: bytes) -> State:
     """The state the journal kept. Raises msgspec.DecodeError when another version of this program wrote it."""
     return msgspec.json.decode(stored, type=State)
-
-
-def _stamp(item: Frame | Reading) -> int:
-    return item.t_ns

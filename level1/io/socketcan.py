@@ -131,11 +131,11 @@ class Batches:
             offset, oldest_ns = 0, now_ns
         else:
             oldest_ns = now_ns - PLAUSIBLE_AGE_NS
-        append = found.append
+        append, make = found.append, tuple.__new__  # as Frame(…) does it, at half the cost
         for (can_id, size, data), (s, ns) in zip(self._cut_frames(self._frame_view[:count * self._size]),
                                                  self._cut_stamps(self._control_view[:count * _CONTROL]), strict=True):
             t_ns = s * 1_000_000_000 + ns - offset
-            append(Frame(t_ns if oldest_ns < t_ns <= now_ns else now_ns, can_id | shift, data[:size]))
+            append(make(Frame, (t_ns if oldest_ns < t_ns <= now_ns else now_ns, can_id | shift, data[:size])))
 
 
 class SocketCan:

@@ -482,9 +482,9 @@ class TestLive:
         unit = Unit(catalog)
         unit.journal.incidents = ("the journal was corrupt",)
         unit.journal.fault = "the disk is full"
-        told = [unit.turn_at(1_000 + step) for step in range(2)]
+        told = [unit.turn_at(1_000 + 100 * step) for step in range(2)]
         unit.journal.fault = None
-        told.append(unit.turn_at(1_002))
+        told.append(unit.turn_at(1_200))
         assert [text for turn in told for kind, text, *_ in turn if kind == "notice"] == [
             "the journal was corrupt", "the disk is full", "the journal works again; nothing waits in memory"]
 
