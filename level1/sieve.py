@@ -251,7 +251,7 @@ class Sieve:
 
     def _packed(self, block: Block) -> set[int]:
         """Trees of parameter groups that a transport session delivers or may deliver in this block."""
-        transport = self.supervisor.transport
+        transport = self.supervisor.subsystems.transport
         if transport is None:
             return set()
         pgns = {j1939_pgn(session.key & 0x1FFF_FFFF) for session in transport.sessions.values()}
