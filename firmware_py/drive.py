@@ -5,7 +5,7 @@ import math
 
 from firmware_py.field import HEADLAND_M, LENGTH_M, TURN_RADIUS_M, Path, Pose
 
-ACCELERATION_M_S2 = 0.4
+ACCELERATION_M_S2 = 0.3
 BRAKE_M_S2, HARD_BRAKE_M_S2 = 0.8, 2.0
 """A pause, and a stop: from 3 km/h within 0.44 m and 0.17 m."""
 PLANNED_M_S2 = 0.3

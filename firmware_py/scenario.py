@@ -14,7 +14,8 @@
     program = "mission_controller"
 
 An order or fault reads `at TIME: SUBJECT ACTION [for TIME | for N commands]`. The subject of a fault is the node, with a dot and
-the device where it has devices; that of an order is the device. `device[2]` is one of several; without it all are meant.
+the device where it has devices; that of an order is the device: the mission controller that knows it takes the order.
+`device[2]` is one of several; without it all are meant.
 """
 from __future__ import annotations
 
@@ -250,15 +251,21 @@ class _Reader:
 
     def _orders(self, texts: list[str], plans: Mapping[str, NodePlan]) -> list[Step]:
         takers = [plan for plan in plans.values() if PROGRAMS[plan.program].ORDERS]
-        if texts and len(takers) != 1:
-            self._problem("orders", f"orders: {'no node takes' if not takers else 'more than one node takes'} orders; "
-                          'one node needs program = "mission_controller"')
+        if texts and not takers:
+            self._problem("orders", 'orders: no node takes orders; one node needs program = "mission_controller"')
             return []
         steps: list[Step] = []
         for text in texts:
-            if (match := self._match(text)) is not None:
-                phrases = PROGRAMS[takers[0].program].ORDERS
-                steps += self._steps(text, match, takers[0].name, match["subject"], phrases, order=True)
+            if (match := self._match(text)) is None:
+                continue
+            subject = match["subject"]
+            of_device = [plan for plan in takers if any(phrase.device == subject for phrase in PROGRAMS[plan.program].ORDERS)]
+            if len(of_device) > 1:
+                names = " and ".join(plan.name for plan in of_device)
+                self._problem(text, f'"{text}": more than one node takes orders to {subject}: {names}')
+                continue
+            phrases = [phrase for plan in of_device or takers for phrase in PROGRAMS[plan.program].ORDERS]
+            steps += self._steps(text, match, (of_device or takers)[0].name, subject, phrases, order=True)
         return steps
 
     def _faults(self, texts: list[str], plans: Mapping[str, NodePlan]) -> list[Step]:

@@ -110,6 +110,13 @@ def test_orders_need_one_node_that_takes_them() -> None:
     assert "more than one node takes orders" in problems('orders = ["at 1 s: flaming on"]\n', twice)[0]
 
 
+def test_an_order_goes_to_the_mission_controller_that_knows_its_device() -> None:
+    nodes = "[nodes.a]\nprogram = 'sprayer_mission'\n[nodes.b]\nprogram = 'vehicle_mission'\n"
+    scenario = parse('orders = ["at 1 s: mission start", "at 2 s: boom open"]\n' + nodes, "test.toml")
+    assert [step.node for step in scenario.steps] == ["b", "a"]
+    assert 'unknown device "bom"; did you mean "boom"?' in problems('orders = ["at 1 s: bom open"]\n', nodes)[0]
+
+
 def test_all_mistakes_are_told_at_once() -> None:
     found = problems('sede = 3\nduration = "x"\nfaults = ["at 1 s: flmer silent", "at x: flamer silent"]\n')
     assert len(found) == 4

@@ -1,7 +1,8 @@
 """The vehicle under level 1, in virtual time: a healthy mission raises nothing, each fault its alarm; orders reach the brakes."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import pytest
 import serial
 
 from firmware_py.drive import KMH
-from firmware_py.field import to_degrees
+from firmware_py.field import CELL_M, LENGTH_M, Pose, WeedMap, paper_map, to_degrees
 from firmware_py.scenario import build, parse
+from firmware_py.sprayer_boom import SprayerBoom
 from firmware_py.vehicle import UTC_START_NS, Vehicle
 from firmware_py.virtual_bus import Simulation
 from level1.catalog import Catalog
@@ -41,7 +43,7 @@ class Farm:
 
     def __init__(self, catalog: Catalog, text: str, armed: Sequence[str] | None = None):
         self.scenario = parse(text, "test.toml")
-        cast = build(self.scenario)
+        self.cast = cast = build(self.scenario)
         self.events: list[Event] = []
         self.results: list[Result] = []
         self.told: list[str] = []
@@ -103,8 +105,47 @@ def test_a_healthy_mission_raises_nothing_but_that_it_is_finished(catalog: Catal
 @pytest.mark.parametrize("name", sorted(file.name for file in SHIPPED.glob("vehicle_*.toml")))
 def test_each_shipped_scenario_of_the_vehicle_runs(catalog: Catalog, name: str) -> None:
     assert load(name).title
-    shown = Farm(catalog, (SHIPPED / name).read_text("utf-8")).run()
+    shown = Farm(catalog, (SHIPPED / name).read_text("utf-8")).run(30)
     assert "executing" in shown.told
+
+
+def test_the_sprayer_boom_behind_it_follows_the_weed_map_without_an_alarm() -> None:
+    """The paper's mission: valves lag up to 2 s, and nothing is raised but what is no fault."""
+    catalog = definitions.load([*FILES, "sprayer_boom.dbc"])
+    mission = Farm(catalog, (SHIPPED / "vehicle_sprayer.toml").read_text("utf-8"))
+    boom = mission.cast.nodes["sprayer"]
+    assert isinstance(boom, SprayerBoom)
+    weeds = paper_map()
+    treated: set[tuple[int, int]] = set()
+    wasted: set[tuple[int, int]] = set()
+    while mission.simulation.now_ns < mission.scenario.duration_ns:
+        mission.run(mission.simulation.now_ns / SECOND + 0.1)
+        for cell, has_weed in cells_under(boom, mission.tractor.drive.pose, weeds):
+            (treated if has_weed else wasted).add(cell)
+    assert {event.alarm for event in mission.events} == {"BoomMoving", "MissionFinished"}
+    number = sum(sum(row) for row in weeds.cells)
+    assert len(treated) > 0.85 * number
+    assert len(wasted) < 0.3 * number
+
+
+def test_a_stuck_valve_of_the_boom_is_told_and_the_mission_goes_on() -> None:
+    catalog = definitions.load([*FILES, "sprayer_boom.dbc"])
+    text = (SHIPPED / "vehicle_sprayer.toml").read_text("utf-8")
+    stuck = Farm(catalog, 'faults = ["at 25 s: sprayer.valve[7] stuck closed"]\n' + text).run(150)
+    assert "raised" in stuck.life("ChangeNozzlesFailure") + stuck.life("Section7NotSet")
+    assert stuck.raised <= {"BoomMoving", "ChangeNozzlesFailure", "Section7NotSet"}
+    assert stuck.tractor.controller == "Executing"
+
+
+def cells_under(boom: SprayerBoom, pose: Pose, weeds: WeedMap) -> Iterator[tuple[tuple[int, int], bool]]:
+    """Cells under open sections, 2 m behind the antenna, and whether there is weed."""
+    heading = math.radians(pose.heading_deg)
+    for section, is_open in enumerate(boom.sections_open, 1):
+        right_m = (section - 6.5) * CELL_M
+        x_m = pose.x_m - 2 * math.sin(heading) + math.cos(heading) * right_m
+        y_m = pose.y_m - 2 * math.cos(heading) - math.sin(heading) * right_m
+        if is_open and 0 <= y_m < LENGTH_M:
+            yield (int(x_m / CELL_M), int(y_m / CELL_M)), weeds.weed(x_m, y_m)
 
 
 # --- each fault, its alarm, its repair, its end -------------------------------------------------------------------------------
