@@ -29,9 +29,9 @@ FIXES = ("NoFix", "Gnss", "Differential", "Precise", "RtkFixed", "RtkFloat", "Es
 """Fix quality by its number in GGA (IEC 61162-1)."""
 MEASURED = range(1, 6)
 """Fix qualities of a position measured by satellites; the others are guesses or inventions."""
-LINKS = ("Receiving", "Quiet", "Garbled", "Frozen", "Unplugged")
+LINKS = ("Receiving", "Quiet", "Garbled", "Frozen", "Unplugged", "Unusable")
 """State of the line: right sentences come; nothing comes; bytes come but no right sentence (wrong baud rate, noise); the
-receiver's clock stands still; the port is gone."""
+receiver's clock stands still; the port is gone; right sentences come, but none that says whether there is a position."""
 
 
 class Navigation(msgspec.Struct, frozen=True):

@@ -29,6 +29,8 @@ QUIET_NS = 3_000_000_000
 """Time without a right sentence after which the receiver counts as not heard."""
 FROZEN_NS = 5_000_000_000
 """Time for which the receiver's clock may stand still while it speaks."""
+UNUSABLE_NS = 10_000_000_000
+"""Time without a word about the position after which the other sentences are worth nothing."""
 LEAD_NS = 5_000_000_000
 """Silence of a leading sentence after which another one leads."""
 KNOT_KM_H = 1.852
@@ -168,6 +170,8 @@ class Navigator:
             return "Quiet" if t_ns - self._byte_ns > QUIET_NS else "Garbled"
         if self._stands is not None and self._said_ns - self._moved_ns > FROZEN_NS:
             return "Frozen"
+        if t_ns - self._said_ns > UNUSABLE_NS:
+            return "Unusable"
         return "Receiving" if self._sentence_ns > self._open_ns else None
 
     # --- what is known ----------------------------------------------------------------------------------------------------

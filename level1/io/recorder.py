@@ -156,7 +156,8 @@ class Recorder:
 
     def _forget(self, count: int) -> None:
         if count:
-            self.dropped += count
+            with self._lock:
+                self.dropped += count
             self._dropped_ns = self._clock()
 
     def _write(self, portion: Iterable[Frame | Send]) -> None:

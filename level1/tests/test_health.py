@@ -213,6 +213,7 @@ class TestAlarmsOfTheReceiver:
         ({"GnssReceiver": "Quiet"}, [(1.0, "GnssNoData", "raised")]),
         ({"GnssReceiver": "Garbled"}, [(1.0, "GnssNoData", "raised")]),
         ({"GnssReceiver": "Frozen"}, [(1.0, "GnssNoData", "raised")]),
+        ({"GnssReceiver": "Unusable", "GnssFix": None}, [(1.0, "GnssNoData", "raised")]),
         ({"GnssReceiver": "Unplugged", "GnssFix": None, "GnssPositionJump": None}, [(1.0, "GnssNoData", "raised")]),
         ({"GnssReceiver": None, "GnssFix": None}, []),
         ({"GnssFix": "NoFix"}, [(10.0, "GnssNoFix", "raised")]),

@@ -17,7 +17,7 @@ from level1.event import Event
 from level1.frame import Frame, frame_key
 from level1.io.definitions import load
 from level1.navigation import HOLDOVER_NS, ClockOffset, Navigation, Place, jump_m
-from level1.nmea import FRESH_NS, FROZEN_NS, LEAD_NS, LONGEST, QUIET_NS, Framer, Navigator
+from level1.nmea import FRESH_NS, FROZEN_NS, LEAD_NS, LONGEST, QUIET_NS, UNUSABLE_NS, Framer, Navigator
 from level1.supervisor import Supervisor
 from level1.tests.plug import FIX, sentence
 
@@ -235,6 +235,15 @@ class TestAge:
         for second in range(8):
             navigator.feed(second * S + 1, gga(min(second, 1)))
             assert navigator.link(second * S + 1) == ("Frozen" if second * S > S + FROZEN_NS else "Receiving")
+
+    def test_a_receiver_that_never_speaks_of_the_position_is_unusable(self) -> None:
+        navigator = Navigator()
+        navigator.opened(0)
+        for second in range(1, 13):
+            navigator.feed(second * S, sentence("GPGSV,1,1,01,03,57,171,40") + sentence("GPVTG,1.0,T,,M,1.0,N,1.8,K,A"))
+            assert navigator.link(second * S) == ("Unusable" if second * S > UNUSABLE_NS else "Receiving")
+        navigator.feed(13 * S, gga())
+        assert navigator.link(13 * S) == "Receiving"
 
     def test_a_receiver_without_a_time_is_not_frozen(self) -> None:
         navigator = Navigator()
