@@ -8,20 +8,23 @@ from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TextIO
 
 from level1.catalog import NORMAL, Catalog
 from level1.event import Event, Send, encode, seconds
 from level1.frame import Frame
+from level1.freeze_frame import STATE_WORDS
 from level1.io import config, definitions
 from level1.io.error import OutsideError
 from level1.io.merged import MergedLog
 from level1.io.replay import Log
-from level1.supervisor import STATE_WORDS, Supervisor
-from ucs import onto, parquet, season
+from level1.supervisor import Supervisor
+from ucs import onto, parquet, plot, season
 from ucs.diff import add_season_arguments
 from ucs.remarks import remarks
 from ucs.render import WORDS, event_line, painted, since, wants_colour
+from ucs.trace import Trace
 
 UNIT, BOOT = "replay", 1
 """Identity of a replay's events; every recording is a run of its own, so that it gives the same bytes beside others."""
@@ -43,6 +46,8 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--dbc", nargs="+", default=[], metavar="FILE", help="definitions; shipped ones go by name alone")
     parser.add_argument("--events", metavar="OUT.jsonl", help="write each event as a line of JSON; - for standard output")
     parser.add_argument("--parquet", metavar="OUT.parquet", help="write the events as a table for DuckDB, Polars and the like")
+    parser.add_argument("--plot", metavar="OUT.png", help="draw what the alarms look at, the alarms and their repairs (also .svg, "
+                        ".pdf); of several recordings a picture each, OUT-NAME.png")
     parser.add_argument("--unit-toml", metavar="FILE", help="which repairs are armed, which files belong to which bus")
     parser.add_argument("--bus", action="append", default=[], metavar="NAME=INDEX", type=_bus,
                         help="take this channel of the recording (with --merge also: this file) as the bus of that index (from 0)")
@@ -62,6 +67,8 @@ def run(args: Namespace) -> int:
         raise OutsideError("no definitions: give --dbc FILE …, or --unit-toml FILE")
     paths = season.recordings(args.log)
     _check_onto(args, paths)
+    if args.plot:
+        plot.check(args.plot)
     if args.dbc or unit is None:
         catalog = definitions.load(args.dbc) if args.dbc else Catalog((), {}, {})
     else:
@@ -74,9 +81,11 @@ def run(args: Namespace) -> int:
         return _run_onto(paths, task, args)
     with ExitStack() as stack:
         out = _Out(args, stack)
-        if len(paths) > 1 and not args.merge:
-            return _run_season(paths, task, args, out)
-        return _run_one(paths, task, out)
+        if len(paths) == 1 or args.merge:
+            return _run_one(paths, task, out, picture=args.plot)
+        if args.plot:
+            return max(_run_one([path], task, out, picture=_picture_of(args.plot, path)) for path in paths)
+        return _run_season(paths, task, args, out)
 
 
 class _Task(NamedTuple):
@@ -209,7 +218,7 @@ def _run_onto(paths: Sequence[str], task: _Task, args: Namespace) -> int:
         out = _Out(args, stack)
         try:
             if args.dbc or args.unit_toml:
-                return _run_one(paths, task, out, player.play)
+                return _run_one(paths, task, out, player.play, args.plot)
             replay = task.replay(paths)
             for _ in player.play(replay.log.batches()):
                 pass
@@ -220,10 +229,12 @@ def _run_onto(paths: Sequence[str], task: _Task, args: Namespace) -> int:
             print(player.summary(), file=out.text, flush=True)
 
 
-def _run_one(paths: Sequence[str], task: _Task, out: _Out, through: Through | None = None) -> int:
-    """One recording, or several as one: told as it is read."""
+def _run_one(paths: Sequence[str], task: _Task, out: _Out, through: Through | None = None, picture: str | None = None) -> int:
+    """One recording, or several as one: told as it is read, and drawn."""
+    trace = Trace(task.catalog) if picture else None
+    drawn: list[Event] = []
     try:
-        replay = task.replay(paths, through)
+        replay = task.replay(paths, _both(through, trace.through if trace else None))
         started, name = time.perf_counter(), str(replay.log.path)
         progress = _Progress(sys.stderr, replay.log)
         out.begin(name)
@@ -231,12 +242,27 @@ def _run_one(paths: Sequence[str], task: _Task, out: _Out, through: Through | No
             progress.clear()
             for event in batch:
                 out.event(name, replay.log.first_ns, event, encode(event))
+            drawn += batch if trace else ()
             progress.show(replay.log.frames_read)
         progress.clear()
         out.end(replay.outcome(task.asked), replay.counts, time.perf_counter() - started)
+        if trace and picture:
+            plot.draw(trace, drawn, picture, replay.log.path.name)
     except OutsideError as error:
         out.error(str(error))
     return 2 if out.failed else 0
+
+
+def _both(first: Through | None, second: Through | None) -> Through | None:
+    if first is None or second is None:
+        return first or second
+    return lambda batches: second(first(batches))
+
+
+def _picture_of(picture: str, path: str) -> str:
+    """The picture's name of one recording among several."""
+    name = Path(picture)
+    return str(name.with_name(f"{name.stem}-{Path(path).name.partition('.')[0]}{name.suffix}"))
 
 
 def _run_season(paths: Sequence[str], task: _Task, args: Namespace, out: _Out) -> int:

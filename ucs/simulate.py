@@ -20,9 +20,10 @@ from firmware_py.participant import BusFrame, Happening
 from firmware_py.quantity import QuantityError, duration_ns
 from firmware_py.scenario import PROGRAMS, Cast, Scenario, ScenarioError, build, parse
 from firmware_py.vehicle import Vehicle
-from firmware_py.virtual_bus import Simulation
+from firmware_py.virtual_bus import FrameListener, Simulation
 from level1.io.error import OutsideError, did_you_mean
 from ucs.nmea_line import nmea_file, nmea_line
+from ucs.supervised import Supervised
 
 SHIPPED = Path(__file__).parent / "scenarios"
 EXTENDED_DIGITS, STANDARD_DIGITS = 8, 3
@@ -48,6 +49,10 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--seed", type=int, help="instead of the scenario's")
     parser.add_argument("--patience", default=PATIENCE, metavar="TIME", help=f"how long a lost bus may stay away ({PATIENCE})")
     parser.add_argument("--log", metavar="OUT.log", help="write the traffic as a candump file")
+    parser.add_argument("--supervise", nargs="*", metavar="FILE.dbc", help="level 1 supervises by these definitions (default: "
+                        "all of the nodes), in virtual time with repairs; on a bus it only listens (`ucs run` repairs there)")
+    parser.add_argument("--plot", metavar="OUT.png", help="draw what the alarms look at, the alarms, their repairs and the path "
+                        "(also .svg, .pdf); supervises")
     parser.add_argument("--nmea", type=Path, metavar="PATH",
                         help="what the tractor's GNSS receiver says: on a bus a serial line of that name, "
                              "which `ucs run` and others can open; in virtual time a file")
@@ -72,8 +77,24 @@ def run(args: argparse.Namespace) -> int:
     channel = str(args.bus or args.channel or "vcan0")
     with open(args.log, "w", encoding="ascii") if args.log else nullcontext() as log, _receiver(args.nmea, cast, live):
         base_ns = time.time_ns() if live else 0
-        on_frame = _recorder(log, channel, base_ns) if log is not None else None
-        return _run_live(args, scenario, cast, on_frame) if live else _run_virtual(scenario, cast, on_frame)
+        recorder = [_recorder(log, channel, base_ns)] if log is not None else []
+        unit = None
+        if args.supervise is not None or args.plot:
+            unit = Supervised(cast, args.supervise or (), acts=not live, picture=args.plot)
+        if live:
+            return _run_live(args, scenario, cast, _each([*recorder, *([unit.overhear] if unit else [])]), unit)
+        return _run_virtual(scenario, cast, _each([*recorder, *([unit.on_frame] if unit else [])]), unit)
+
+
+def _each(listeners: Sequence[FrameListener]) -> FrameListener | None:
+    """One listener that calls all of them; None for none."""
+    if len(listeners) < 2:
+        return listeners[0] if listeners else None
+
+    def call(t_ns: int, frame: BusFrame) -> None:
+        for listener in listeners:
+            listener(t_ns, frame)
+    return call
 
 
 @contextmanager
@@ -112,11 +133,14 @@ def load(name: str) -> Scenario:
 # --- virtual time -----------------------------------------------------------------------------------------------------------
 
 
-def _run_virtual(scenario: Scenario, cast: Cast, on_frame: Callable[[int, BusFrame], None] | None) -> int:
-    simulation = Simulation(cast.participants, on_frame=on_frame, on_happening=_teller(sys.stdout, flush=False))
+def _run_virtual(scenario: Scenario, cast: Cast, on_frame: FrameListener | None, unit: Supervised | None) -> int:
+    participants = (*cast.participants, *([unit.participant] if unit else []))
+    simulation = Simulation(participants, on_frame=on_frame, on_happening=_teller(sys.stdout, flush=False))
     began_ns = time.monotonic_ns()
     try:
         simulation.run(scenario.duration_ns)
+        if unit:
+            unit.end(simulation.now_ns, scenario.title)
     finally:
         real_s = max((time.monotonic_ns() - began_ns) / 1e9, 1e-9)
         sys.stdout.write(_summary(cast, simulation.now_ns, simulation.frames))
@@ -158,7 +182,8 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _run_live(args: argparse.Namespace, scenario: Scenario, cast: Cast, on_frame: Callable[[int, BusFrame], None] | None) -> int:
+def _run_live(args: argparse.Namespace, scenario: Scenario, cast: Cast, on_frame: FrameListener | None,
+              unit: Supervised | None) -> int:
     import logging
 
     import can
@@ -185,6 +210,8 @@ def _run_live(args: argparse.Namespace, scenario: Scenario, cast: Cast, on_frame
         raise OutsideError(str(error)) from error
     finally:
         if bus.frames:
+            if unit:
+                unit.end(clock.now_ns(), scenario.title)
             sys.stdout.write(_summary(cast, clock.now_ns(), bus.frames))
             sys.stdout.flush()
     return 0
