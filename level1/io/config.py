@@ -40,12 +40,29 @@ class Unit(msgspec.Struct, frozen=True):
     fleet: str = "fleet"
 
 
+class CanopenDevice(msgspec.Struct, frozen=True):
+    """A CANopen device on a bus. node: its id, 1 to 127. eds: its data sheet, a file beside the configuration or a shipped one.
+
+    name, heartbeat: instead of what the data sheet says (heartbeat "0 s": it sends none). required: told as silent also when it
+    was never heard; without that, an implement that is not coupled is no fault. history: read its last errors by SDO when it
+    reports an emergency.
+    """
+
+    node: int
+    eds: str | None = None
+    name: str | None = None
+    heartbeat_ns: int | None = None
+    required: bool = False
+    history: bool = False
+
+
 class Bus(msgspec.Struct, frozen=True):
     """A CAN bus. interface, channel, bitrate, fd: as python-can takes them; options: further arguments of it.
 
     dbc: files bound to this bus; a name that is no file beside the configuration is one of the shipped definitions.
     j1939: source address that the UCS claims on this bus (128 to 247 are for nodes that choose by themselves); without it the
-    UCS claims none and reports no trouble codes of its own there.
+    UCS claims none and reports no trouble codes of its own there. canopen: devices known beforehand; others are supervised from
+    their first heartbeat on.
     """
 
     name: str
@@ -55,6 +72,7 @@ class Bus(msgspec.Struct, frozen=True):
     bitrate: int | None = None
     fd: bool = False
     j1939: int | None = None
+    canopen: tuple[CanopenDevice, ...] = ()
     options: dict[str, Any] = {}
 
 
@@ -281,6 +299,7 @@ def _bus_problems(buses: Any) -> Iterator[str]:
         address = bus.get("j1939") if isinstance(bus, dict) else None
         if isinstance(address, int) and not 0 <= address <= 253:
             yield f"bus[{index}].j1939: {address} is no source address; take one of 0 to 253, best of 128 to 247"
+        yield from _canopen_problems(bus.get("canopen") if isinstance(bus, dict) else None, f"bus[{index}].canopen")
     if not buses:
         yield "bus: no bus; add a [[bus]] table with name, channel and dbc"
     tables = [bus if isinstance(bus, Mapping) else {} for bus in buses]
@@ -293,6 +312,17 @@ def _bus_problems(buses: Any) -> Iterator[str]:
             yield f'bus: {count} buses use the {interface} channel "{channel}"; join their dbc lists'
     if buses and not any(bus.get("dbc") for bus in tables):
         yield 'bus[0].dbc: no bus has definitions; name the DBC files, such as dbc = ["flaming_tool.dbc"]'
+
+
+def _canopen_problems(devices: Any, path: str) -> Iterator[str]:
+    """Node ids that can't be, or that two devices share."""
+    tables = [device for device in devices if isinstance(device, dict)] if isinstance(devices, list) else []
+    nodes = Counter(device["node"] for device in tables if isinstance(device.get("node"), int))
+    for node, count in nodes.items():
+        if not 1 <= node <= 127:
+            yield f"{path}: {node} is no node id; take one of 1 to 127"
+        elif count > 1:
+            yield f"{path}: {count} devices have the node id {node}; each on a bus has its own"
 
 
 def _hashable(bus: Mapping[str, Any]) -> bool:
@@ -335,7 +365,11 @@ def _resolved(config: Config, path: str) -> Config:
     def definitions(name: str) -> str:
         return beside(name) if (folder / name).exists() else name
 
-    buses = tuple(msgspec.structs.replace(bus, dbc=tuple(map(definitions, bus.dbc))) for bus in config.bus)
+    def device(one: CanopenDevice) -> CanopenDevice:
+        return msgspec.structs.replace(one, eds=definitions(one.eds)) if one.eds else one
+
+    buses = tuple(msgspec.structs.replace(bus, dbc=tuple(map(definitions, bus.dbc)), canopen=tuple(map(device, bus.canopen)))
+                  for bus in config.bus)
     journal = config.journal and JournalFile(beside(config.journal.path))
     recorder = config.recorder and msgspec.structs.replace(config.recorder, path=beside(config.recorder.path))
     bridge = config.bridge
