@@ -234,7 +234,9 @@ class Navigator:
             self._keep(t_ns, said, "time_of_day_ns")
         if stands is None or stands != self._stands:
             self._moved_ns = t_ns
-        self._stands, self._said_ns = stands, t_ns
+        self._stands = stands
+        if said["fix"] is not None:
+            self._said_ns = t_ns
         self._rtk_seen = self._rtk_seen or said["fix"] == FIXES.index("RtkFixed")
         jump = None
         if said.get("latitude_deg") is not None and said.get("longitude_deg") is not None and said["fix"] in MEASURED:
@@ -289,7 +291,7 @@ def _place_of(sentence: Any, fix: int | None) -> dict[str, Any]:
 
 def _gga(sentence: Any) -> dict[str, Any]:
     """Fix: time, position, quality, satellites, dilution of precision, altitude above the geoid, age of corrections."""
-    fix = _whole(sentence.quality, 0, len(FIXES) - 1)
+    fix = 2 if sentence.quality == 9 else _whole(sentence.quality, 0, len(FIXES) - 1)  # NovAtel's 9: corrected by satellites
     altitude = _number(getattr(sentence, "alt", None), -2500, 20_000)
     return {**_place_of(sentence, fix), "fix": fix, "satellites": _whole(getattr(sentence, "numSV", None), 0, 99),
             "hdop": _number(getattr(sentence, "HDOP", None), 0, 99.99), "altitude_m": altitude if fix else None,

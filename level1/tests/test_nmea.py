@@ -240,7 +240,8 @@ class TestAge:
         navigator = Navigator()
         navigator.opened(0)
         for second in range(1, 13):
-            navigator.feed(second * S, sentence("GPGSV,1,1,01,03,57,171,40") + sentence("GPVTG,1.0,T,,M,1.0,N,1.8,K,A"))
+            navigator.feed(second * S, sentence("GPGSV,1,1,01,03,57,171,40") + sentence("GPVTG,1.0,T,,M,1.0,N,1.8,K,A")
+                           + sentence(FIX.replace(",4,12,", ",77,12,")))
             assert navigator.link(second * S) == ("Unusable" if second * S > UNUSABLE_NS else "Receiving")
         navigator.feed(13 * S, gga())
         assert navigator.link(13 * S) == "Receiving"
