@@ -243,7 +243,7 @@ class TestAge:
             navigator.feed(second * S, sentence("GPGSV,1,1,01,03,57,171,40") + sentence("GPVTG,1.0,T,,M,1.0,N,1.8,K,A")
                            + sentence(FIX.replace(",4,12,", ",77,12,")))
             assert navigator.link(second * S) == ("Unusable" if second * S > UNUSABLE_NS else "Receiving")
-        navigator.feed(13 * S, gga())
+        navigator.feed(13 * S, gga(13))
         assert navigator.link(13 * S) == "Receiving"
 
     def test_a_receiver_without_a_time_is_not_frozen(self) -> None:
