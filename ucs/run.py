@@ -5,17 +5,19 @@ import signal
 import sys
 import time
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from level1.canopen import Device
 from level1.catalog import Catalog
 from level1.event import Event
 from level1.io import config, definitions
 from level1.io.can import Port
+from level1.io.canopen import HistoryReader, devices
 from level1.io.config import Config
 from level1.io.error import OutsideError
 from level1.io.inbox import Inbox
@@ -45,6 +47,7 @@ def run(args: Namespace) -> int:
     catalog = definitions.load((), settings.bus_files, settings.bus_names)
     config.check_armed(settings, catalog)
     own = readings.messages(settings, catalog)
+    known = devices(settings)
     if args.check:
         print(*_start_lines(settings, catalog), f"{settings.path}: good", sep="\n")
         return 0
@@ -60,9 +63,11 @@ def run(args: Namespace) -> int:
         journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name))
         uplink = stack.enter_context(Uplink(journal, inbox, time.monotonic_ns))
         sources = readings.start(settings, catalog, ports, journal, inbox, stack)
-        live = Live(_supervisor(settings, catalog, journal, own), journal, ports, inbox, clock=time.monotonic_ns,
-                    wall=time.time_ns, told=_teller(printer), notice=lambda text: printer.err(f"ucs: {text}"), link=uplink,
-                    house=sources.house, gnss=sources.gnss, recorder=sources.recorder, quiet=readings.quiet(settings))
+        histories = HistoryReader(settings.bus, inbox.notice)
+        stack.callback(histories.stop)
+        live = Live(_supervisor(settings, catalog, journal, own, known), journal, ports, inbox, clock=time.monotonic_ns,
+                    wall=time.time_ns, told=_teller(printer, histories), notice=lambda text: printer.err(f"ucs: {text}"),
+                    link=uplink, house=sources.house, gnss=sources.gnss, recorder=sources.recorder, quiet=readings.quiet(settings))
         stack.callback(lambda: printer.out("\n".join(_end_lines(live, ports, sources))))
         with _ended_by_signals(live):
             printer.out("\n".join(_start_lines(settings, catalog)))
@@ -71,11 +76,12 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def _supervisor(settings: Config, catalog: Catalog, journal: Journal, own: frozenset[str]) -> Supervisor:
+def _supervisor(settings: Config, catalog: Catalog, journal: Journal, own: frozenset[str],
+                known: Sequence[Device]) -> Supervisor:
     """The supervisor of this boot, with the latches and budgets of the last one."""
     return Supervisor(catalog, unit=settings.unit.name, boot=journal.boot, armed=settings.repairs.armed,
                       start_ns=time.monotonic_ns(), j1939=settings.j1939, restored=_restored(journal),
-                      monitor_ns=settings.bridge.period_ns if settings.bridge else None, readings=own)
+                      monitor_ns=settings.bridge.period_ns if settings.bridge else None, readings=own, devices=known)
 
 
 def _restored(journal: Journal) -> State | None:
@@ -89,10 +95,14 @@ def _restored(journal: Journal) -> State | None:
                            "out, then set another [journal] path") from None
 
 
-def _teller(printer: Printer) -> Callable[[Event], None]:
-    """Prints a line for each event."""
+def _teller(printer: Printer, histories: HistoryReader) -> Callable[[Event], None]:
+    """Prints a line for each event, and has error histories read."""
     colour = wants_colour(sys.stdout)
-    return lambda event: printer.out(event_line(event, clock(event), colour))
+
+    def tell(event: Event) -> None:
+        printer.out(event_line(event, clock(event), colour))
+        histories.told(event)
+    return tell
 
 
 @contextmanager
@@ -111,7 +121,8 @@ def _start_lines(settings: Config, catalog: Catalog) -> Iterator[str]:
     yield painted(f"{settings.unit.name} of {settings.unit.fleet}", "1", wants_colour(sys.stdout))
     for bus in settings.bus:
         files = ", ".join(Path(name).name for name in bus.dbc) or "no definitions"
-        yield f"  bus {bus.name}: {bus.interface} {bus.channel} ({files})"
+        nodes = ", ".join(f"{device.node}" for device in bus.canopen)
+        yield f"  bus {bus.name}: {bus.interface} {bus.channel} ({files}){f'; CANopen nodes {nodes}' if nodes else ''}"
     repairable = [name for name, alarm in catalog.alarms.items() if alarm.repair]
     armed = [name for name in repairable if name in settings.repairs.armed]
     passive = [name for name in repairable if name not in settings.repairs.armed]

@@ -86,6 +86,7 @@ class HistoryReader:
         self._waiting: queue.Queue[tuple[int, int] | None] = queue.Queue(WAITING)
         self._asked_s: dict[tuple[int, int], float] = {}
         self._thread: threading.Thread | None = None
+        self._stopping = False
 
     def told(self, event: Event) -> None:
         """An event: an emergency of a device whose history is wanted is followed by a reading. Never blocks."""
@@ -104,14 +105,15 @@ class HistoryReader:
             self._thread.start()
 
     def stop(self) -> None:
-        """End the thread."""
+        """End the thread; readings that wait are dropped."""
+        self._stopping = True
         if self._thread is not None:
             self._waiting.put(None)
             self._thread.join()
             self._thread = None
 
     def _work(self) -> None:
-        while (device := self._waiting.get()) is not None:
+        while (device := self._waiting.get()) is not None and not self._stopping:
             bus, node = device
             try:
                 with _Line(self._buses[bus], node) as line:

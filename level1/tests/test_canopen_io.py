@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import threading
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -115,6 +116,15 @@ def reader(channel: str) -> Iterator[Callable[..., HistoryReader]]:
     assert not [thread for thread in threading.enumerate() if thread.name == "error histories"]
 
 
+def wait_for(happened: Callable[[], bool]) -> None:
+    """Until something has happened in another thread, for five seconds at most."""
+    for _ in range(500):
+        if happened():
+            return
+        time.sleep(0.01)
+    pytest.fail("it did not happen")
+
+
 def emergency(node: int = 42, event: str = "raised", alarm: str = "DeviceEmergency") -> Event:
     return Event("tractor-7", 1, 1, seconds(0), None, False, alarm, 1021, "High", event, 1, 0, {"Bus": 0, "Node": node}, "")
 
@@ -130,7 +140,7 @@ def test_an_emergency_is_followed_by_reading_the_history_whose_answers_pass_on_t
         while len(answers) < 4 and (message := listener.recv(5.0)) is not None:
             if message.arbitration_id == 0x5AA:
                 answers.append(bytes(message.data))
-        one.stop()
+    wait_for(lambda: one.read == 1)
     assert [(answer[3], int.from_bytes(answer[4:6], "little")) for answer in answers] == [
         (0, 3), (1, 0x3120), (2, 0xFF10), (3, 0x8250)]
     assert (one.read, notices) == (1, [])
@@ -144,6 +154,7 @@ def test_only_wanted_devices_are_asked_and_not_again_and_again(channel: str, rea
         one.told(event)
     for now_s[0] in (0.0, 5.0, 10.0):
         one.told(emergency())
+    wait_for(lambda: len(asked) == 2)
     one.stop()
     assert len(asked) == 2, "nobody answers on this bus"
     assert asked[0] == "bus implement: the error history of node 42 can't be read (No SDO response received)"
@@ -153,5 +164,5 @@ def test_a_bus_that_can_not_be_opened_is_told_and_the_reader_lives_on(reader: Ca
     notices: list[str] = []
     one = reader(notices.append, "nosuch")
     one.told(emergency())
-    one.stop()
+    wait_for(lambda: bool(notices))
     assert len(notices) == 1 and "can't be read" in notices[0]
