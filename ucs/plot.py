@@ -33,6 +33,7 @@ LOCKED = "#495057"
 MARKS = {"repair_started": (">", "#1864ab", "repair started"), "repair_failed": ("X", "#c92a2a", "repair failed"),
          "repaired": ("o", "#2f9e44", "repaired"), "locked_out": ("s", "#212529", "locked out"),
          "acknowledged": ("D", "#862e9c", "acknowledged")}
+MISSING_COLOURS = {"error": "#c92a2a"}
 MARK_OFFSETS = {"repair_started": -0.2, "repair_failed": 0.2}
 """A failed attempt and the next one often have the same time."""
 ACTUAL_STYLE: dict[str, Any] = {"color": ACTUAL, "linewidth": 1.4}
@@ -203,6 +204,7 @@ def _draw_lane(axis: Any, lane: Lane, origin_ns: int, length_s: float, scale: fl
         if ranks is not None:
             values = [math.nan if math.isnan(value) else ranks[value] for value in values]
         axis.step(times, values, where="post", **style)
+        _draw_missing(axis, line, times)
     signal = lane.actual.signal
     unit = f"  [{signal.unit}]" if signal.unit else ""
     name = f"{lane.actual.message.name}.{signal.name}{unit}"
@@ -216,9 +218,23 @@ def _draw_lane(axis: Any, lane: Lane, origin_ns: int, length_s: float, scale: fl
         _number_ticks(axis, lane)
 
 
+def _draw_missing(axis: Any, line: Line, times: Sequence[float]) -> None:
+    """Where there was no value, and why."""
+    for word, start, end in zip(line.words, times, times[1:], strict=False):
+        if word:
+            colour = MISSING_COLOURS.get(word, EXPECTED)
+            axis.axvspan(start, end, ymin=0.32, ymax=0.68, facecolor="none", edgecolor=colour, hatch="////", linewidth=0, alpha=0.7)
+            if end - start > times[-1] * 0.08:
+                axis.text((start + end) / 2, 0.5, word, transform=axis.get_xaxis_transform(), ha="center", va="center", fontsize=7,
+                          color=colour, bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})
+
+
 def _number_ticks(axis: Any, lane: Lane) -> None:
     values = [value for line in (lane.actual, lane.expected) if line for value in line.values if math.isfinite(value)]
-    low, high = (min(values), max(values)) if values else (0.0, 1.0)
+    if not values:
+        axis.set_yticks([])
+        return
+    low, high = min(values), max(values)
     room = (high - low) * 0.12 or max(abs(high), 1.0) * 0.1
     axis.set_ylim(low - room, high + room)
     axis.set_yticks([low, high] if high > low else [low], [f"{value:.5g}" for value in ([low, high] if high > low else [low])],

@@ -22,11 +22,11 @@ UNIT = "simulated"
 class Supervised:
     """The unit of a simulation. participant: for the bus. Every repair is armed, as in a replay.
 
-    files: definitions, those of the cast's nodes if there are none. picture: where to draw it. acts: it may send.
+    files: definitions, those of the cast's nodes if there are none. picture: where to draw it. acts: it may send. out: default standard output.
     """
 
     def __init__(self, cast: Cast, files: Sequence[str] = (), *, acts: bool = True, picture: str | None = None,
-                 out: TextIO = sys.stdout):
+                 out: TextIO | None = None):
         if picture:
             plot.check(picture)
         spoken = list(dict.fromkeys(name for node in cast.nodes.values() for name in (node.DBC, *node.MORE_DBC)))
@@ -34,7 +34,8 @@ class Supervised:
         self.events: list[Event] = []
         self._supervisor = Supervisor(catalog, unit=UNIT, start_ns=0, armed=None if acts else (), broadcast=acts)
         self.participant = SimulatedUnit(self._supervisor, self._deliver)
-        self._picture, self._out, self._colour = picture, out, wants_colour(out)
+        self._picture, self._out = picture, out or sys.stdout
+        self._colour = wants_colour(self._out)
         self._trace = Trace(catalog, definitions.load(spoken)) if picture else None
 
     def on_frame(self, t_ns: int, frame: BusFrame) -> None:

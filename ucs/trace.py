@@ -6,14 +6,15 @@ from array import array
 from collections.abc import Iterable, Iterator
 
 from level1.catalog import STALE_CYCLES, Catalog, Message, Signal
-from level1.decode import Scale, raw_of, reserved
+from level1.decode import ERROR, QUALITY_WORDS, Scale, raw_of, reserved
 from level1.frame import BUS_SHIFT, EXTENDED, Frame, frame_key, j1939_pgn
 from ucs import inputs
 from ucs.inputs import Input
 
 
 class Line:
-    """One signal over time. times_ns, values: where it changed; NaN where it was not available or its message was silent.
+    """One signal over time. times_ns, values: where it changed; NaN where there was none, and then in words why: "error",
+    "unavailable" (reserved values of J1939), "silent" (its message).
 
     Values are raw where the signal has a value table, else physical.
     """
@@ -21,6 +22,7 @@ class Line:
     def __init__(self, message: Message, signal: Signal):
         self.message, self.signal = message, signal
         self.times_ns, self.values = array("q"), array("d")
+        self.words: list[str] = []
         self._scale = Scale(signal)
         self._reserved = reserved(signal) if message.j1939 else ()
         self._raw: int | float | None = None
@@ -37,12 +39,13 @@ class Line:
         raw = raw_of(self.signal, data)
         if raw is not None and raw != self._raw:
             self._raw = raw
-            self._add(t_ns, self._value(raw))
+            word = self._word(raw)
+            self._add(t_ns, math.nan if word else float(raw if self.signal.choices else self._scale.physical(raw)), word)
 
     def lose(self, t_ns: int) -> None:
         """The message has been silent for too long."""
         self._raw = None
-        self._add(t_ns, math.nan)
+        self._add(t_ns, math.nan, "silent")
 
     def _is_there(self, data: bytes) -> bool:
         signal = self.signal
@@ -53,14 +56,18 @@ class Line:
             signal = selector
         return True
 
-    def _value(self, raw: int | float) -> float:
-        if any(low <= raw <= high for low, high, _ in self._reserved) and raw not in self.signal.choices:
-            return math.nan
-        return float(raw if self.signal.choices else self._scale.physical(raw))
+    def _word(self, raw: int | float) -> str:
+        """Why a raw value is none; "" for one that is."""
+        if raw in self.signal.choices:
+            return ""
+        if not math.isfinite(raw):
+            return QUALITY_WORDS[ERROR]
+        return next((QUALITY_WORDS[quality] for low, high, quality in self._reserved if low <= raw <= high), "")
 
-    def _add(self, t_ns: int, value: float) -> None:
+    def _add(self, t_ns: int, value: float, word: str) -> None:
         self.times_ns.append(t_ns)
         self.values.append(value)
+        self.words.append(word)
 
 
 class _Heard:
