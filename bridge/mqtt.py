@@ -188,6 +188,9 @@ class MqttConnection:
             if self.address.tls:
                 self._client.tls_set_context(tls_context(tls))
             self._check(self._client.connect(self.address.host, self.address.port, keepalive=keep_alive_s))
+            if isinstance(sock := self._client.socket(), socket.socket):
+                # else an alarm waits up to 40 ms for the TCP acknowledgement of the message before it
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         except ssl.SSLCertVerificationError as error:
             raise MqttError(f"broker {self.address}: its certificate is refused ({error.verify_message}); "
                             "set [bridge] ca to the authority that signed it") from None

@@ -33,6 +33,7 @@ certfile {folder}/broker.pem
 keyfile {folder}/broker-key.pem
 crlfile {folder}/crl.pem
 tls_version tlsv1.2
+set_tcp_nodelay true
 require_certificate true
 use_identity_as_username true
 allow_anonymous false

@@ -17,9 +17,10 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 import msgspec
 from msgspec import Meta
 
-from level1.event import SCHEMA, SentFrame
+from level1.event import SCHEMA as SCHEMA
 from level1.event import Event as Event
 from level1.event import Monitor as Monitor
+from level1.event import SentFrame
 from level1.event import decode as _decode_event
 from level1.event import encode as _encode_event
 from level1.event import seconds as seconds

@@ -1,7 +1,6 @@
 """The site of `ucs bridge --make-site` with the real mosquitto: whom it lets in, and to what; bridge and level 2 over mTLS."""
 from __future__ import annotations
 
-import shutil
 import socket
 import stat
 import subprocess
@@ -18,28 +17,15 @@ from bridge.delivered import delivered_path, delivered_upto
 from bridge.mqtt import Address, MqttConnection, MqttError, Tls
 from bridge.session import BridgeThread
 from bridge.site import Authority, SiteError, make_site
+from bridge.tests.brokers import free_port, listens, mosquitto
 from bridge.tests.peer import FLEET, UNIT, Unit, eventually
 from level1.event import seconds
-
-MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/sbin:/bin:/usr/local/sbin:/usr/local/bin")
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 class Site:
     """A site with two units, one of them revoked, and its broker running."""
 
     def __init__(self, folder: Path):
-        assert MOSQUITTO, "mosquitto is not installed: apt-get install mosquitto"
         self.folder = folder / "site"
         self.address = Address("127.0.0.1", free_port(), True)
         self.authority = make_site(self.folder, FLEET, [UNIT, "tractor-8"], ["127.0.0.1", "localhost"], self.address.port)
@@ -51,7 +37,7 @@ class Site:
             configuration.write_text("user root\n" + configuration.read_text())
         self.log = self.folder / "log"
         with open(self.log, "wb") as log:
-            self.process = subprocess.Popen([MOSQUITTO, "-c", str(configuration)], stdout=log, stderr=log)
+            self.process = subprocess.Popen([mosquitto(), "-c", str(configuration)], stdout=log, stderr=log)
         eventually(lambda: listens(self.address.port) or self.process.poll() is not None)
         assert self.process.poll() is None, self.log.read_text()
 

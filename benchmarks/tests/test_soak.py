@@ -1,0 +1,42 @@
+"""The trials of the soak, short: each finds nothing lost and nobody obeyed, and would say so if it did."""
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from benchmarks import soak
+
+
+def test_killed_writers_lose_nothing() -> None:
+    row = soak.kill_writer(30, random.Random(2))
+    assert row.good and row.outcome == "0 lost, 0 boot ids reused"
+
+
+def test_bad_commands_of_every_kind_are_refused_for_the_right_reason() -> None:
+    row = soak.forge_commands(1500, random.Random(2))
+    assert row.good, row
+
+
+def test_a_gate_that_lets_something_through_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bridge.gate.VALID_NS", 60 * soak.S)
+    assert not soak.forge_commands(300, random.Random(2)).good
+
+
+def test_the_counts_go_into_the_page_and_nothing_else_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = tmp_path / "reliability.md"
+    page.write_text(soak.PAGE.read_text(encoding="utf-8"), encoding="utf-8")
+    monkeypatch.setattr(soak, "PAGE", page)
+    before = page.read_text(encoding="utf-8")
+    soak.put_into_page([soak.Row("fault", "2 times", "0 lost", True)])
+    after = page.read_text(encoding="utf-8")
+    assert "| fault | 2 times | 0 lost |" in after
+    assert before.partition(soak.BEGIN)[0] == after.partition(soak.BEGIN)[0]
+    assert before.partition(soak.END)[2] == after.partition(soak.END)[2]
+
+
+@pytest.mark.parametrize("line", [line for line in soak.PAGE.read_text(encoding="utf-8").splitlines() if line.endswith("` |")])
+def test_every_test_the_page_names_exists(line: str) -> None:
+    root = soak.PAGE.parents[1]
+    assert all((root / name).is_file() for name in line.split("`")[1::2])
