@@ -74,8 +74,9 @@ class Unit:
         if now_ns >= self.event_due_ns:
             self.event_due_ns += EVENT_NS
             self.events += 1
-            event = Event(self.name, 1, self.events, seconds(time.monotonic_ns()), None, False, "NozzlesNotSet", 2109, "Medium", "raised",
-                          self.events, 0, {"SPRAYER_STATUS.Valves": 4095, "SPRAYER_CMD.Valves": 4094}, "Nozzles not set")
+            now = seconds(time.monotonic_ns())
+            event = Event(self.name, 1, self.events, now, None, False, "NozzlesNotSet", 2109, "Medium", "raised", self.events,
+                          0, {"SPRAYER_STATUS.Valves": 4095, "SPRAYER_CMD.Valves": 4094}, "Nozzles not set")
             payload = wire.encode(wire.alarm_message(event, self.events - 1, False))
             self._pending[self.events] = (payload, now_ns + RETRY_NS)
             self._publish(self._alarm, payload)
