@@ -6,13 +6,14 @@ WHEEL_VENV := .venv-wheel
 PACKAGES := level1 bridge firmware_py dbc level2 ucs
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test check test-wheel soak clean packages packages-vcan
+.PHONY: help demo test check test-wheel golden soak clean packages packages-vcan
 
 help:
 	@echo "make demo        simulated tractor and implements, faults, repairs, level 2: about a minute"
 	@echo "make test        ruff, mypy, import rules, all tests (those on virtual CAN buses too)"
 	@echo "make check       ruff, mypy and import rules only"
 	@echo "make test-wheel  the unit tests against the built and installed wheel"
+	@echo "make golden      declare the events that the examples give now (see examples/README.md)"
 	@echo "make soak        kills, power cuts and forged commands at length: about ten minutes"
 	@echo "make clean       remove what these made"
 
@@ -44,6 +45,9 @@ test-wheel: $(VENV)/ready
 # Writes its counts into docs/reliability.md.
 soak: $(VENV)/ready packages-vcan
 	$(BIN)/python -m benchmarks.soak --write
+
+golden: $(VENV)/ready
+	$(BIN)/python -m examples.golden
 
 clean:
 	rm -rf $(VENV) $(WHEEL_VENV) dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -22,7 +22,8 @@ UNIT = "simulated"
 class Supervised:
     """The unit of a simulation. participant: for the bus. Every repair is armed, as in a replay.
 
-    files: definitions, those of the cast's nodes if there are none. picture: where to draw it. acts: it may send. out: default standard output.
+    files: definitions, those of the cast's nodes if there are none. picture: where to draw it. acts: it may send.
+    out: standard output if none is given.
     """
 
     def __init__(self, cast: Cast, files: Sequence[str] = (), *, acts: bool = True, picture: str | None = None,
