@@ -1,0 +1,196 @@
+"""CANopen on real SocketCAN: the air-blast sprayer's devices as processes, and nodes of the package `canopen` as peers."""
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import canopen
+import pytest
+
+import dbc
+from hil_tests.conftest import ROOT, Process
+
+pytestmark = pytest.mark.vcan
+
+START_S = 40.0
+SILENT_S = 1.75
+"""Three and a half heartbeats of 500 ms."""
+SLOW_S = 5.0
+"""A guest without CPU of its own may be late by so much."""
+UNIT = """
+[unit]
+name = "tractor-7"
+[[bus]]
+name = "implement"
+channel = "vcan0"
+dbc = ["airblast_sprayer.dbc", "ucs.dbc"]
+[[bus.canopen]]
+node = 42
+eds = "airblast_sprayer.eds"
+history = true
+[[bus.canopen]]
+node = 43
+eds = "ultrasonic_sensors.eds"
+[repairs]
+armed = ["Ultrasonic3NotWorking", "UltrasonicNotOperational", "AirblastNotOperational"]
+[journal]
+path = "journal.db"
+"""
+SCENARIO = """
+duration = "10 min"
+orders = ["at 3 s: spraying on"]
+faults = [{faults}]
+[nodes.sprayer]
+program = "airblast_sprayer"
+[nodes.sensors]
+program = "ultrasonic_sensors"
+[nodes.mission]
+program = "airblast_mission"
+"""
+SPRAYER, SENSORS, UNKNOWN = 42, 43, 7
+Start = Callable[..., Process]
+
+
+@pytest.fixture
+def run(process: Start, tmp_path: Path) -> Process:
+    """`ucs run`, supervising vcan0."""
+    (tmp_path / "unit.toml").write_text(UNIT)
+    started = process("run", "unit.toml")
+    started.expect("; supervising$", START_S)
+    return started
+
+
+@pytest.fixture
+def simulate(process: Start, tmp_path: Path) -> Callable[..., Process]:
+    """Starts nodes of the orchard's scenario as a process of their own: `simulate("sensors", faults='…')`."""
+
+    def start(*nodes: str, faults: str = "") -> Process:
+        scenario = tmp_path / f"{'-'.join(nodes)}.toml"
+        scenario.write_text(SCENARIO.format(faults=faults))
+        return process("simulate", scenario, "--bus", "vcan0", *(word for node in nodes for word in ("--node", node)))
+    return start
+
+
+class Peer:
+    """The package's own network on vcan0."""
+
+    def __init__(self) -> None:
+        package: Any = canopen
+        self.network = package.Network(can.Bus(channel="vcan0", interface="socketcan"))
+        self.network.connect()
+
+    def device(self, node: int, eds: str = "") -> Any:
+        """A device by the package: booted, operational, with its heartbeat."""
+        local = self.network.create_node(node, str(dbc.path(eds or "airblast_sprayer.eds")))
+        for state in ("INITIALISING", "PRE-OPERATIONAL", "OPERATIONAL"):
+            local.nmt.state = state
+        return local
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    one = Peer()
+    yield one
+    one.network.disconnect()
+
+
+def journal(folder: Path, alarm: str) -> list[dict[str, Any]]:
+    """The events of an alarm, as `ucs journal` tells them."""
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), *sys.path[1:]))}
+    command = [sys.executable, "-m", "ucs", "journal", "unit.toml", "--alarm", alarm, "--format", "jsonl", "--values"]
+    told = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=True).stdout
+    return [json.loads(line) for line in told.splitlines()]
+
+
+def test_a_dead_sensor_is_reset_by_nmt_and_verified_by_its_heartbeat(run: Process, simulate: Callable[..., Process]) -> None:
+    sprayer = simulate("sprayer", "mission")
+    sensors = simulate("sensors", faults='"at 12 s: sensors.sensor[3] dead"')
+    sprayer.expect("spraying on", START_S)
+    sensors.expect("sensor 3 has failed", START_S)
+    run.expect("DeviceEmergency +raised.*sensor 3 gives no echo", SLOW_S)
+    run.expect("Ultrasonic3NotWorking +raised", SLOW_S)
+    run.expect("Ultrasonic3NotWorking +repair started", SLOW_S)
+    sensors.expect("is reset by NMT", SLOW_S)
+    sensors.expect("starts anew", SLOW_S)
+    run.expect("Ultrasonic3NotWorking +repaired", SLOW_S)
+    run.expect("Ultrasonic3NotWorking +cleared", SLOW_S)
+    assert not any("Silent" in line for line in run.out), "a reset that was ordered is no silence"
+
+
+def test_a_device_that_dies_is_told_as_silent_and_cleared_when_it_is_back(
+        run: Process, simulate: Callable[..., Process], tmp_path: Path) -> None:
+    simulate("sprayer", "mission")
+    sensors = simulate("sensors")
+    with can.Bus(channel="vcan0", interface="socketcan", can_filters=[{"can_id": 0x72B, "can_mask": 0x7FF}]) as bus:
+        while (message := bus.recv(START_S)) is not None and bytes(message.data) != b"\5":
+            pass
+        assert message is not None, "operational"
+    time.sleep(1)
+    sensors.kill()
+    run.expect("DeviceSilent +raised.*Node 43, Device Ultrasonic sensors", SILENT_S + SLOW_S)
+    run.expect("UltrasonicSilent +raised", 4 + SLOW_S)
+    simulate("sensors")
+    run.expect("DeviceSilent +cleared", START_S)
+    assert run.stop() == 0
+    events = journal(tmp_path, "DeviceSilent")
+    assert [event["event"] for event in events] == ["raised", "cleared"]
+    assert events[0]["values"]["LastState"] == "operational"
+    assert events[0]["text"] == "Ultrasonic sensors (node 43): no heartbeat for 1.75 s"
+
+
+def test_level_1_starts_devices_that_nobody_started(run: Process, simulate: Callable[..., Process], peer: Peer) -> None:
+    simulate("sensors")
+    run.expect("UltrasonicNotOperational +raised", START_S)
+    run.expect("UltrasonicNotOperational +repaired", SLOW_S)
+
+
+def test_emergencies_and_error_history_of_a_node_by_the_package(run: Process, peer: Peer, tmp_path: Path) -> None:
+    device = peer.device(SPRAYER)
+    device.set_data(0x1003, 1, (0x3120).to_bytes(4, "little"))
+    device.set_data(0x1003, 2, (0x8130).to_bytes(4, "little"))
+    device.set_data(0x1003, 0, b"\2")
+    time.sleep(1)
+    device.emcy.send(0x3120, 0x05, b"\1\2\3\4\5")
+    run.expect("DeviceEmergency +raised.*Device Air-blast sprayer.*supply voltage too low", SLOW_S)
+    time.sleep(3)
+    device.emcy.reset()
+    run.expect("DeviceEmergency +cleared", SLOW_S)
+    assert run.stop() == 0
+    raised, cleared = journal(tmp_path, "DeviceEmergency")
+    assert raised["values"]["ErrorRegister"] == "generic, voltage"
+    assert raised["values"]["MakerBytes"] == "0102030405"
+    assert cleared["values"]["ErrorHistory"] == "0x3120 0x8130", "read by SDO from the node"
+
+
+def test_a_node_nobody_configured_is_learned_and_missed(run: Process, peer: Peer) -> None:
+    device = peer.device(UNKNOWN)
+    time.sleep(3)
+    device.emcy.send(0x8130, 0x11)
+    run.expect("DeviceEmergency +raised.*Node 7,.*a heartbeat or life guard it waits for is missing", SLOW_S)
+    device.nmt.stop_heartbeat()
+    run.expect("DeviceSilent +raised.*Node 7,", SILENT_S + SLOW_S)
+    device.nmt.start_heartbeat(500)
+    run.expect("DeviceSilent +cleared", SLOW_S)
+    device.nmt.stop_heartbeat()
+
+
+def test_the_simulated_devices_are_understood_by_the_package(simulate: Callable[..., Process], peer: Peer) -> None:
+    simulate("sprayer", "sensors", "mission").expect("spraying on", START_S)
+    sensors = peer.network.add_node(SENSORS, str(dbc.path("ultrasonic_sensors.eds")))
+    sprayer = peer.network.add_node(SPRAYER, str(dbc.path("airblast_sprayer.eds")))
+    assert sensors.nmt.wait_for_heartbeat(5) == "OPERATIONAL"
+    assert sprayer.sdo[0x1008].raw == "Air-blast sprayer"
+    assert sprayer.sdo[0x1018][2].raw == 42
+    sprayer.tpdo.read()
+    assert sprayer.tpdo[2].wait_for_reception(5) is not None
+    assert 150 < sprayer.tpdo[2]["Main line.Tank level"].raw <= 200, "half per cents"
+    sensors.nmt.state = "RESET"
+    sensors.nmt.wait_for_bootup(5)
+    assert sensors.nmt.wait_for_heartbeat(5) == "OPERATIONAL", "the mission controller has started it"
