@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import errno
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -12,18 +13,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from level1.bus_health import Report
 from level1.catalog import Catalog
 from level1.command import Order
 from level1.decode import encode
 from level1.event import Event, Monitor, Result, Send
-from level1.frame import EXTENDED, Frame, frame_key
+from level1.frame import ERROR, EXTENDED, Frame, frame_key
 from level1.io import live
-from level1.io.can import WAITING_SENDS, BusError, Port, open_bus
+from level1.io.can import WAITING_SENDS, BusError, Interface, Port, open_bus
 from level1.io.config import Bus
 from level1.io.definitions import load
 from level1.io.host import clock_is_synchronised
 from level1.io.inbox import Inbox
+from level1.io.listening import Listening
 from level1.io.python_can import PythonCan
+from level1.io.socketcan import Filter
 from level1.io.stamps import PLAUSIBLE_AGE_NS, Stamps
 from level1.supervisor import Supervisor
 
@@ -71,17 +75,58 @@ class Wire:
         self.closed = True
 
 
+class Direct:
+    """Stands for an interface with a descriptor, which the loop reads itself."""
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+        self.heard: list[Frame] = []
+        self.filters: Sequence[Filter] | None = None
+        self.error: OSError | None = None
+        self.full = self.closed = False
+        self.lost = self.impossible = 0
+        self.last_ns: int | None = None
+        self._end, self._other = socket.socketpair()
+
+    def fileno(self) -> int:
+        return self._end.fileno()
+
+    def receive(self, bus: int) -> list[Frame]:
+        if self.error is not None:
+            raise self.error
+        frames, self.frames = self.frames, []
+        return frames
+
+    def errors(self, bus: int) -> list[Frame]:
+        heard, self.heard = self.heard, []
+        return heard
+
+    def listen(self, filters: Sequence[Filter] | None) -> None:
+        self.filters = filters
+
+    def send(self, key: int, data: bytes) -> bool:
+        return not self.full
+
+    def traffic(self) -> None:
+        return None
+
+    def close(self) -> None:
+        self.closed = True
+        self._end.close()
+        self._other.close()
+
+
 class Opener:
     """Opens the wires in turn, through python-can's adapter; an exception in their place is raised."""
 
     def __init__(self, *wires: Any):
         self.wires = list(wires)
 
-    def __call__(self, settings: Bus, clock: Callable[[], int], wall: Callable[[], int]) -> PythonCan:
+    def __call__(self, settings: Bus, clock: Callable[[], int], wall: Callable[[], int]) -> Interface:
         wire: Any = self.wires.pop(0) if self.wires else Wire()
         if isinstance(wire, Exception):
             raise wire
-        return adapted(wire)
+        return wire if isinstance(wire, Direct) else adapted(wire)
 
 
 def adapted(wire: Any) -> PythonCan:
@@ -253,6 +298,63 @@ class TestPort:
         assert received and received.arbitration_id == 0x18FEF100 and received.is_extended_id
 
 
+class TestDirectPort:
+    """An interface with a descriptor: the loop reads it, the bus's thread looks after it."""
+
+    def reports(self, inbox: Inbox, wanted: int) -> list[tuple[str, bool]]:
+        """So many reports, as soon as they are there."""
+        got: list[tuple[str, bool]] = []
+
+        def enough() -> bool:
+            got.extend((report.alarm, report.present) for report in inbox.take().reports)
+            return len(got) >= wanted
+        until(enough)
+        return got
+
+    def test_a_loop_that_is_late_is_helped_out(self, started: Any) -> None:
+        wire = Direct()
+        _, inbox = started(wire)
+        wire.frames.append(Frame(1, 0x123, b""))
+        assert until(lambda: inbox.take().frames) == [Frame(1, 0x123, b"")]
+
+    def test_an_interface_lost_while_the_loop_reads_is_reported_and_opened_anew(self, started: Any) -> None:
+        wire, anew = Direct(), Direct()
+        port, inbox = started(wire, BusError("still gone"), anew)
+        wire.error = OSError(errno.ENETDOWN, "Network is down")
+        assert port.fetch() == []
+        assert self.reports(inbox, 2) == [("CanBusDown", True), ("CanBusDown", False)]
+        assert wire.closed and not port.is_lost
+        anew.frames.append(Frame(1, 0x123, b""))
+        assert port.fetch() or until(lambda: inbox.take().frames)
+
+    def test_the_filters_hold_after_it_was_opened_anew(self, started: Any) -> None:
+        wire, anew = Direct(), Direct()
+        port, inbox = started(wire, anew)
+        port.listen(Listening(((1, 2),), lambda can_id: None))
+        wire.error = OSError(errno.ENODEV, "No such device")
+        self.reports(inbox, 2)
+        assert wire.filters == anew.filters == ((1, 2),)
+
+    def test_error_frames_are_understood_and_handed_on(self, started: Any) -> None:
+        wire = Direct()
+        port, inbox = started(wire)
+        wire.heard.append(Frame(5, ERROR | 0x40, bytes(8)))
+        load_ = until(lambda: next((load_ for load_ in [inbox.take()] if load_.reports), None))
+        assert load_.reports[0].alarm == "CanBusOff" and load_.reports[0].t_ns == 5 and port.state == "BusOff"
+        wire.last_ns = 6
+        assert self.reports(inbox, 1) == [("CanBusOff", False)]
+
+    def test_frames_lost_on_the_way_in_and_out_are_reported(self, started: Any) -> None:
+        wire = Direct()
+        port, inbox = started(wire)
+        wire.lost = 7
+        assert self.reports(inbox, 1) == [("FramesLost", True)] and port.counters["lost on the way in"] == 7
+        wire.full = True
+        port.send(send(0, 5), 0)
+        assert port.flush(6) is None
+        assert ("SendFailed", True) in self.reports(inbox, 1) + self.reports(inbox, 1)
+
+
 def send(t_ns: int, expires_ns: int, number: int = 0, key: int = 0x110) -> Send:
     return Send(t_ns, key, bytes([number]), "FLAMER_CMD", "test", expires_ns)
 
@@ -352,7 +454,7 @@ def catalog() -> Catalog:
 class Unit:
     """A live loop over the flaming tool's definitions, with clocks that stand; `log` is what happened, in order."""
 
-    def __init__(self, catalog: Catalog, monitor_ns: int | None = None):
+    def __init__(self, catalog: Catalog, monitor_ns: int | None = None, nap: Callable[[float], None] = time.sleep, **more: Any):
         self.catalog = catalog
         self.clock, self.wall = Clock(), Clock(1_700_000_000_000 * MS)
         self.log: list[Any] = []
@@ -361,10 +463,10 @@ class Unit:
         self.port = Port(0, BUS, self.inbox, self.clock, self.wall, Opener(self.wire))
         self.port._wire = adapted(self.wire)
         self.journal = Journal(self.log)
-        supervisor = Supervisor(catalog, unit="a", boot=1, start_ns=self.clock(), monitor_ns=monitor_ns)
+        supervisor = Supervisor(catalog, unit="a", boot=1, start_ns=self.clock(), monitor_ns=monitor_ns, **more)
         self.live = live.Live(supervisor, self.journal, [self.port], self.inbox, clock=self.clock, wall=self.wall,
                               told=lambda event: self.log.append(("told", event)),
-                              notice=lambda text: self.log.append(("notice", text)), link=self)
+                              notice=lambda text: self.log.append(("notice", text)), link=self, nap=nap)
 
     def publish(self, events: Sequence[Event], outputs: Sequence[Monitor | Result]) -> None:
         self.log.extend(("heads up", event.event) for event in events)
@@ -495,6 +597,59 @@ class TestLive:
         happened = unit.turn_at(1_001)
         assert happened[0] == ("notice", "50 frames dropped, the oldest first: supervision can't keep up")
         assert unit.live.dropped == 50
+
+    def test_frames_of_an_interface_with_a_descriptor_are_fetched_by_the_loop(self, catalog: Catalog) -> None:
+        unit = Unit(catalog)
+        unit.turn_at(1_000)
+        wire = Direct()
+        unit.port._wire = wire
+        for ms in range(1_000, 1_400, 100):
+            wire.frames.append(Frame(ms * MS, 0x210, encode(
+                catalog.messages["FLAMER_STATUS"], {"Flaming": 1, "PilotFlame": 0, "Safeguard": 4}, None)))
+        unit.turn_at(1_310)
+        assert unit.told()[0] == (1.3, "raised")
+
+    def test_what_the_last_boot_left_of_a_bus_is_over_unless_it_is_reported_again(self) -> None:
+        catalog = load(["ucs.dbc"])
+        first = Supervisor(catalog, unit="a", boot=1, start_ns=0)
+        first.tick(0)
+        for bus in ("implement", "gone"):
+            first.report(0, "CanBusDown", bus, True, {"Bus": bus}, "")
+        first.tick(1)
+        unit = Unit(catalog, restored=first.state())
+        unit.inbox.report([Report(1_000 * MS, "CanBusDown", "implement", True, {"Bus": "implement"}, "still")])
+        unit.turn_at(1_003)
+        causes = unit.live.supervisor.causes("CanBusDown")
+        assert list(causes) == ["implement"]
+        unit.inbox.report([Report(1_500 * MS, "CanBusDown", "implement", False, {"Bus": "implement", "AwaySeconds": 0.5}, "")])
+        unit.turn_at(1_503)
+        cleared = [event for kind, event in (entry for entry in unit.log if entry[0] == "told") if event.event == "cleared"][-1]
+        assert cleared.values == {"Bus": "implement", "AwaySeconds": 0.5} and float(cleared.t) == 1.5
+
+    def test_dropped_frames_are_an_alarm_that_counts_them(self) -> None:
+        unit = Unit(load(["ucs.dbc"]))
+        unit.turn_at(1_000)
+        unit.inbox.put([Frame(1_001 * MS, 0x123, b"")] * 150)
+        unit.turn_at(1_002)
+        for ms in range(1_100, 13_000, 100):
+            unit.turn_at(ms)
+        told = [event for kind, event in (entry for entry in unit.log if entry[0] == "told") if event.alarm == "FramesLost"]
+        assert [event.event for event in told] == ["raised", "cleared"] and told[1].values == {"Frames": 50}
+
+    def test_it_follows_the_address_that_the_ucs_claims(self, catalog: Catalog) -> None:
+        unit = Unit(catalog, j1939={0: 0x80})
+        unit.port._wire = wire = Direct()
+        unit.turn_at(1_002)
+        assert wire.filters is not None and (EXTENDED | 0x80, 0xC000_00FF) in wire.filters
+
+    def test_on_a_busy_bus_it_naps_and_on_a_quiet_one_it_does_not(self, catalog: Catalog) -> None:
+        naps: list[float] = []
+        unit = Unit(catalog, nap=naps.append)
+        unit.turn_at(1_000)
+        unit.status(1_001 * MS)
+        unit.turn_at(1_001)
+        unit.live.turn(1.0)
+        assert naps == [live.NAP_NS / 1e9] and live.NAP_NS <= MS
 
     def test_it_stops_and_stores_the_state(self, catalog: Catalog) -> None:
         unit = Unit(catalog)
