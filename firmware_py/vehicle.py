@@ -3,13 +3,15 @@
 Theory of operation. Every tick of 50 ms: requests and watches → controller state → plant. The controller:
 
     Ready ──Start──▶ Executing ──Pause, signs of life lost, position lost──▶ Paused ──Resume──▶ Executing
-    Executing ──end of the path──▶ Ready          any but Disabled ──someone takes the wheel──▶ Manual ──▶ Ready
-    any but Disabled ──Stop, stop switch──▶ Stopped ──Resume──▶ Ready          Executing ──10 s without movement──▶ Stopped
+    Ready ──Pause──▶ Paused ──Resume──▶ Ready     Executing ──end of the path──▶ Ready
+    any but Disabled, Stopped ──someone takes the wheel──▶ Manual ──▶ Ready
+    any but Disabled ──Stop, stop switch──▶ Stopped   Executing ──10 s without movement──▶ Stopped
+    Stopped ──start button; Resume, if it was stopped by a request──▶ Ready
 
 It obeys Pause and Stop at once with its brakes. New movements of hitch, PTO and implement begin in Ready and Executing only,
-whatever comes over the bus: elsewhere somebody may be near. Stopped, Manual and Disabled switch PTO and implement off, an
-engine that stops ends the PTO, and they come back only when Off and Unset were commanded in between. Drivers are energised once
-a command: a part that did not obey tries again on Retry only.
+whatever comes over the bus: elsewhere somebody may be near. Stopped, Manual and Disabled switch PTO and implement off and hold
+the hitch, an engine that stops ends the PTO, and they come back only when Off, Unset or Hold was commanded in between. Drivers
+are energised once a command: a part that did not obey tries again on Retry only.
 
 The engine, the speeds, the hitch, the PTO and the position are told as J1939 and ISO 11783 have them, too, each from the source
 address of the device that says it on a real tractor; and as NMEA 0183 to `nmea`, a serial line.
@@ -58,6 +60,8 @@ NO_VALUE = bytes([0xFF] * 8)
 LIMIT, REQUEST = "DriveSpeedLimit", "Request"
 MOVABLE = ("Ready", "Executing")
 HELD = ("Stopped", "Manual", "Disabled")
+HARMLESS = {"PtoWanted": "Off", "ImplementWanted": "Unset", "HitchMove": "Hold"}
+"""What must be commanded once after a stop before anything else counts."""
 REASONS = {"Command": "on command", "Switch": "by the stop switch", "CommandsLost": "without signs of life of the mission",
            "NotMoving": "because it does not move", "PositionLost": "without a position"}
 
@@ -99,7 +103,8 @@ class Vehicle(Node):
         Phrase("gnss", "float", "RTK without fixed ambiguities: some decimetres"),
         Phrase("gnss", WORKS, "RTK fixed again", lasts=False),
         Phrase("stop_switch", "pressed", "somebody presses it"),
-        Phrase("stop_switch", WORKS, "is released; the vehicle stays stopped until resumed at the machine", lasts=False),
+        Phrase("stop_switch", WORKS, "is released; the vehicle stays stopped", lasts=False),
+        Phrase("start_button", "pressed", "somebody at the machine ends a stop", lasts=False),
         Phrase("", "manual", "somebody takes the wheel"),
         *COMMON_FAULTS,
     )
@@ -139,7 +144,8 @@ class Vehicle(Node):
         self._guided_ns = self._placed_ns = self._moved_ns = start_ns
         self._guide_counter: Value | None = None
         self._heard_as: dict[str, tuple[int, Mapping[str, Value]]] = {}
-        self._released = {"PtoWanted": False, "ImplementWanted": False}
+        self._released = dict.fromkeys(HARMLESS, False)
+        self._paused_from = "Ready"
         self._hitch_held = True
         self._unplugged = False
         self._codes = 0
@@ -162,7 +168,7 @@ class Vehicle(Node):
             before = self._heard_as.get(message)
             self._heard_as[message] = (t_ns, values)
             for signal in self._released:
-                if values.get(signal) in ("Off", "Unset"):
+                if values.get(signal) == HARMLESS[signal]:
                     self._released[signal] = True
             if values["Retry"] == "On" and (before is None or before[1]["Retry"] != "On"):
                 self._retry(t_ns, message)
@@ -172,11 +178,13 @@ class Vehicle(Node):
         match request, self.controller:
             case "Stop", "Ready" | "Manual" | "Executing" | "Paused" | "Stopped":
                 self._stop("Command")
-            case "Pause", "Executing":
+            case "Pause", "Ready" | "Executing":
                 self._pause("Command")
+            case "Resume", "Paused" if self._paused_from == "Ready":
+                self._ready()
             case "Resume", "Paused" if self._may_drive(t_ns):
                 self._execute(t_ns)
-            case "Resume", "Stopped" if not self._pressed:
+            case "Resume", "Stopped" if self.reason == "Command":
                 self._ready()
             case "Start", "Ready" if self.mission in ("Loaded", "Running") and self._may_drive(t_ns):
                 self.mission = "Running"
@@ -192,6 +200,7 @@ class Vehicle(Node):
         self._moved_ns = self._placed_ns = t_ns
 
     def _pause(self, reason: str) -> None:
+        self._paused_from = self.controller
         self.controller, self.reason = "Paused", reason
 
     def _stop(self, reason: str) -> None:
@@ -244,7 +253,7 @@ class Vehicle(Node):
             self._placed_ns = t_ns
         if self.drive.speed_m_s > MOVES_M_S or self._limit_kmh == 0:
             self._moved_ns = t_ns
-        if self._pressed and self.controller not in ("Disabled", "Stopped"):
+        if self._pressed and self.controller != "Disabled":
             self._stop("Switch")
         elif self.controller == "Executing":
             if t_ns - self._moved_ns >= NOT_MOVING_NS:
@@ -264,7 +273,7 @@ class Vehicle(Node):
         if may or wanted == "Unset" or self.controller in HELD:
             self.implement.advance(t_ns, wanted)
         heard = self._fresh("VEHICLE_HITCH_CMD", t_ns)
-        if heard is None or heard["HitchMove"] != "Move" or not may:
+        if heard is None or heard["HitchMove"] != "Move" or not may or not self._released["HitchMove"]:
             self.hitch.advance(None, self._dt_s)
             self._hitch_held = True
         else:
@@ -315,6 +324,8 @@ class Vehicle(Node):
         pgn = can_id >> 8 & 0xFFFF
         if pgn == _VP_PGN and self.fix == "NoFix":
             data = NO_VALUE
+        elif pgn == _VDS_PGN and self.fix == "NoFix":
+            data = NO_VALUE[:4] + data[4:]
         elif pgn == _EFL_PGN and self._unplugged:
             data = data[:OIL_BYTE] + bytes([SENSOR_ERROR]) + data[OIL_BYTE + 1:]
         source = self._sources.get(can_id)
@@ -457,6 +468,9 @@ class Vehicle(Node):
                 self.fix = {"lost": "NoFix", "float": "RtkFloat"}.get(action, "RtkFixed")
             case "stop_switch", action:
                 self._pressed = action == "pressed"
+            case "start_button", "pressed":
+                if self.controller == "Stopped" and not self._pressed:
+                    self._ready()
             case "", "manual":
                 if self.controller not in ("Disabled", "Stopped"):
                     self.controller, self.reason = "Manual", "None"
@@ -500,4 +514,4 @@ class Vehicle(Node):
 
 _PTO_WORDS = {"RunningUp": "runs up", "On": "on", "RunningDown": "runs down", "Off": "off"}
 _POSITION_ID = 514
-_VP_PGN, _EFL_PGN = 65267, 65263
+_VP_PGN, _VDS_PGN, _EFL_PGN = 65267, 65256, 65263

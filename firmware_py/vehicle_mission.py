@@ -2,8 +2,8 @@
 
 Theory of operation. It is told what to do (`mission start`, `pto on`, `hitch by path`). VEHICLE_GUIDE is its sign of life: it
 stops when the vehicle has been silent for 1 s, so that nothing drives unseen. VEHICLE_CMD is sent once for each order, with the
-speed limit that was ordered last by whomever. After a stop or manual driving it withdraws PTO and implement, after a stop of the
-engine the PTO: they have to be ordered anew.
+speed limit that was ordered last by whomever. After a stop, manual driving or that silence it withdraws hitch, PTO and
+implement, after a stop of the engine the PTO: they have to be ordered anew.
 
 The rule of the two senders: while an alarm in VEHICLE_ALARMS reads Repairing or LockedOut, it does not send the command that this
 alarm's repair holds. A lock-out withdraws what was ordered there, and pauses the mission.
@@ -109,11 +109,17 @@ class VehicleMission(Node):
     def _heed(self, t_ns: int, status: Mapping[str, Value]) -> None:
         """What must not come back by itself is withdrawn."""
         held = status["Controller"] in HELD
-        if held and self._implement or self._pto and (held or status["EngineState"] == "Off"):
+        if held:
+            self._withdraw_all(t_ns, str(status["Controller"]).lower())
+        elif self._pto and status["EngineState"] == "Off":
             self._pto = False
-            self._implement = self._implement and not held
-            why = f"the vehicle is {status['Controller']}".lower() if held else "the engine does not run"
-            self.tell(t_ns, f"withdraws {'PTO and implement' if held else 'the PTO'}: {why}")
+            self.tell(t_ns, "withdraws the PTO: the engine does not run")
+
+    def _withdraw_all(self, t_ns: int, why: str) -> None:
+        if self._pto or self._implement or self._hitch is not None:
+            self._pto = self._implement = False
+            self._hitch = None
+            self.tell(t_ns, f"withdraws hitch, PTO and implement: the vehicle is {why}")
 
     def _alarms_changed(self, t_ns: int, states: Mapping[str, Value]) -> None:
         held = {HOLDS[alarm]: alarm for alarm, state in states.items() if alarm in HOLDS and state in ("Repairing", "LockedOut")}
@@ -146,6 +152,8 @@ class VehicleMission(Node):
 
     def tick(self, t_ns: int) -> None:
         """One tick of 50 ms."""
+        if self._heard_ns is not None and t_ns - self._heard_ns >= SILENT_NS:
+            self._withdraw_all(t_ns, "silent")
         if self._start_ns is not None and t_ns >= self._start_ns:
             self._start_ns = None
             self._once.append("Start")

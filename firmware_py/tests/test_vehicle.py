@@ -150,7 +150,7 @@ def test_nothing_makes_it_faster_than_its_limit_or_drive_backwards(ticks: list[t
 # --- the controller -----------------------------------------------------------------------------------------------------------
 
 WAYS: Sequence[tuple[str, str, str]] = [
-    ("Ready", "Pause", "Ready"), ("Ready", "Resume", "Ready"), ("Ready", "Stop", "Stopped"), ("Ready", "Start", "Executing"),
+    ("Ready", "Pause", "Paused"), ("Ready", "Resume", "Ready"), ("Ready", "Stop", "Stopped"), ("Ready", "Start", "Executing"),
     ("Executing", "Pause", "Paused"), ("Executing", "Resume", "Executing"), ("Executing", "Stop", "Stopped"),
     ("Executing", "Start", "Executing"), ("Paused", "Pause", "Paused"), ("Paused", "Resume", "Executing"),
     ("Paused", "Stop", "Stopped"), ("Paused", "Start", "Paused"), ("Stopped", "Pause", "Stopped"), ("Stopped", "Resume", "Ready"),
@@ -181,8 +181,23 @@ def test_a_pressed_stop_switch_can_not_be_overruled() -> None:
         assert bench.vehicle.controller == "Stopped"
     bench.break_("stop_switch", WORKS).run(5)
     assert bench.vehicle.controller == "Stopped", "released it stays stopped"
-    bench.order("mission", "resume").run(1).order("mission", "start").run(5)
+    assert bench.order("mission", "resume").run(1).vehicle.controller == "Stopped", "level 2 does not end it either"
+    bench.break_("start_button", "pressed").run(1).order("mission", "start").run(5)
     assert bench.kmh == pytest.approx(3)
+
+
+def test_a_pressed_stop_switch_is_stronger_than_a_stop_on_command_and_the_start_button() -> None:
+    bench = Bench().start().run(5).order("mission", "stop").run(1).break_("stop_switch", "pressed").run(1)
+    assert bench.says("VEHICLE_STATUS", "StopReason") == "Switch"
+    assert bench.break_("start_button", "pressed").run(1).vehicle.controller == "Stopped"
+
+
+def test_who_is_paused_before_the_start_does_not_start_and_is_ready_again_when_resumed() -> None:
+    bench = Bench().run(1).order("mission", "pause").run(1).order("mission", "start").run(5)
+    assert bench.vehicle.controller == "Paused"
+    assert bench.kmh == 0
+    assert bench.order("mission", "resume").run(1).vehicle.controller == "Ready"
+    assert bench.order("mission", "start").run(5).kmh == pytest.approx(3)
 
 
 @pytest.mark.parametrize("fault", ["silent", "frozen", "reset"])
@@ -257,6 +272,78 @@ def test_nothing_begins_to_move_while_somebody_may_be_near(state: str) -> None:
     assert bench.vehicle.pto.rpm == 0
     assert bench.vehicle.hitch.position == 100
     assert bench.vehicle.implement.position == "Unset"
+
+
+REQUESTS = st.sampled_from(["None", "Pause", "Resume", "Stop", "Start"])
+ON_OFF = st.sampled_from(["On", "Off"])
+DEEDS = st.one_of(
+    st.tuples(st.just("VEHICLE_CMD"), st.fixed_dictionaries({"Request": REQUESTS, "DriveSpeedLimit": st.sampled_from([0, 1, 6])})),
+    st.tuples(st.just("VEHICLE_PTO_CMD"), st.fixed_dictionaries({"PtoWanted": ON_OFF, "Retry": ON_OFF})),
+    st.tuples(st.just("VEHICLE_HITCH_CMD"), st.fixed_dictionaries(
+        {"HitchMove": st.sampled_from(["Hold", "Move"]), "Retry": ON_OFF, "HitchWanted": st.sampled_from([0, 50, 100])})),
+    st.tuples(st.just("VEHICLE_IMPLEMENT_CMD"), st.fixed_dictionaries(
+        {"ImplementWanted": st.sampled_from(["Set", "Unset"]), "Retry": ON_OFF})),
+    st.sampled_from([("fault", deed) for deed in (
+        ("", "manual"), ("", WORKS), ("stop_switch", "pressed"), ("stop_switch", WORKS), ("start_button", "pressed"),
+        ("engine", "dies"), ("engine", WORKS), ("gnss", "lost"), ("gnss", WORKS), ("", "reset"), ("hitch", "stuck"),
+        ("hitch", WORKS), ("pto", "refuses"), ("pto", WORKS), ("implement", "refuses"), ("implement", WORKS))]))
+
+
+@given(st.lists(st.tuples(DEEDS, st.sampled_from([0.05, 0.2, 1.0, 3.0])), max_size=40))
+@settings(max_examples=150, deadline=None)
+def test_no_sequence_of_inputs_begins_a_movement_where_somebody_may_be_near(deeds: list[tuple[tuple[str, object], float]]) -> None:
+    bench = Bench().run(0.2)
+    bench.simulation.detach(bench.mission)
+    vehicle = bench.vehicle
+    commands: dict[str, dict[str, Value]] = {}
+    for number, ((message, what), seconds) in enumerate(deeds):
+        if isinstance(what, tuple):
+            bench.break_(*what)
+        elif isinstance(what, dict):
+            bench.send(message, **what)
+            if message != "VEHICLE_CMD":
+                commands[message] = what
+        for step in range(round(seconds / 0.05)):
+            bench.send("VEHICLE_GUIDE", GuideCounter=(number + step) % 16)
+            for cyclic, values in commands.items():
+                bench.send(cyclic, **values)
+            before = (vehicle.controller, vehicle.hitch.position, vehicle.pto.clutch.position, vehicle.implement.position,
+                      vehicle.drive.speed_m_s)
+            bench.run(0.05)
+            state, hitch, clutch, implement, speed_m_s = before
+            if state == vehicle.controller and state not in ("Ready", "Executing"):
+                assert vehicle.hitch.position == hitch
+                assert (clutch, vehicle.pto.clutch.position) != ("Off", "On")
+                assert (implement, vehicle.implement.position) != ("Unset", "Set")
+                assert vehicle.drive.speed_m_s <= speed_m_s
+
+
+@pytest.mark.parametrize("how", ["manual", "stop", "reset"])
+def test_nothing_comes_back_by_itself_when_it_is_ready_again(how: str) -> None:
+    bench = Bench().run(0.5)
+    bench.simulation.detach(bench.mission)
+
+    def command(pto: str, hitch: str, implement: str) -> None:
+        for _ in range(40):
+            bench.send("VEHICLE_PTO_CMD", PtoWanted=pto, Retry="Off")
+            bench.send("VEHICLE_HITCH_CMD", HitchMove=hitch, Retry="Off", HitchWanted=0)
+            bench.send("VEHICLE_IMPLEMENT_CMD", ImplementWanted=implement, Retry="Off").run(0.1)
+    command("Off", "Hold", "Unset")
+    command("On", "Move", "Set")
+    assert bench.vehicle.pto.state == "On"
+    bench.vehicle.hitch.position = 50.0
+    if how == "reset":
+        bench.break_("", "reset")
+    else:
+        bench.break_("", "manual") if how == "manual" else bench.break_("stop_switch", "pressed")
+        bench.run(5).break_("", WORKS).break_("stop_switch", WORKS).break_("start_button", "pressed")
+    command("On", "Move", "Set")
+    command("On", "Move", "Set")
+    assert bench.vehicle.controller == "Ready"
+    assert (bench.vehicle.pto.rpm, bench.vehicle.hitch.position, bench.vehicle.implement.position) == (0, 50, "Unset")
+    command("Off", "Hold", "Unset")
+    command("On", "Move", "Set")
+    assert (bench.vehicle.pto.state, bench.vehicle.hitch.position, bench.vehicle.implement.position) == ("On", 0, "Set")
 
 
 def test_after_an_engine_stop_the_pto_stays_off_until_off_was_commanded() -> None:
@@ -379,6 +466,7 @@ def test_unused_bits_of_j1939_are_ones() -> None:
 def test_a_lost_position_is_not_available() -> None:
     bench = Bench().run(2).break_("gnss", "lost").run(1)
     assert bench.listener.last("VP").data == bytes([0xFF] * 8)
+    assert bench.listener.last("VDS").data[:4] == bytes([0xFF] * 4)
     assert bench.listener.last("VEHICLE_POSITION").data == bytes([0xFF] * 8)
     assert bench.says("VEHICLE_MOTION", "PositionFix") == "NoFix"
 

@@ -1,6 +1,7 @@
 """The vehicle under level 1, in virtual time: a healthy mission raises nothing, each fault its alarm; orders reach the brakes."""
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from decimal import Decimal
@@ -17,7 +18,7 @@ from firmware_py.vehicle import UTC_START_NS, Vehicle
 from firmware_py.virtual_bus import Simulation
 from level1.catalog import Catalog
 from level1.command import Order
-from level1.event import Event, Output, Result
+from level1.event import Event, Monitor, Output, Result
 from level1.io import definitions
 from level1.navigation import FIXES
 from level1.nmea import Navigator
@@ -41,13 +42,14 @@ def catalog() -> Catalog:
 class Farm:
     """Tractor, mission controller and level 1. events: what level 1 reported; results: of orders."""
 
-    def __init__(self, catalog: Catalog, text: str, armed: Sequence[str] | None = None):
+    def __init__(self, catalog: Catalog, text: str, armed: Sequence[str] | None = None, monitor_ns: int | None = None):
         self.scenario = parse(text, "test.toml")
         self.cast = cast = build(self.scenario)
         self.events: list[Event] = []
         self.results: list[Result] = []
+        self.monitors: list[Monitor] = []
         self.told: list[str] = []
-        self.supervisor = Supervisor(catalog, unit="tractor-7", start_ns=0, armed=armed)
+        self.supervisor = Supervisor(catalog, unit="tractor-7", start_ns=0, armed=armed, monitor_ns=monitor_ns)
         self.unit = SimulatedUnit(self.supervisor, self._deliver)
         self.simulation = Simulation([*cast.participants, self.unit], on_happening=lambda said: self.told.append(said.text))
         tractor = cast.nodes["tractor"]
@@ -56,6 +58,7 @@ class Farm:
 
     def _deliver(self, outputs: Sequence[Output]) -> None:
         self.events += [output for output in outputs if isinstance(output, Event)]
+        self.monitors += [output for output in outputs if isinstance(output, Monitor)]
         self.results += [output for output in outputs if isinstance(output, Result)]
 
     def run(self, until_s: float | None = None) -> Farm:
@@ -148,6 +151,30 @@ def cells_under(boom: SprayerBoom, pose: Pose, weeds: WeedMap) -> Iterator[tuple
             yield (int(x_m / CELL_M), int(y_m / CELL_M)), weeds.weed(x_m, y_m)
 
 
+# --- monitoring ---------------------------------------------------------------------------------------------------------------
+
+
+def test_monitoring_tells_controller_and_motion_every_250_ms_and_a_lost_position_has_no_value(catalog: Catalog) -> None:
+    text = f'orders = {list(WORK)}\nfaults = ["at 20 s: tractor.gnss lost"]\n' + NODES.format("")
+    seen = Farm(catalog, text, monitor_ns=SECOND // 4).run(15)
+
+    def last(message: str) -> dict[str, object]:
+        sample = [monitor for monitor in seen.monitors if monitor.message == message][-1]
+        return {name.rpartition(".")[2]: value for name, value in sample.values.items()}
+    times = [monitor.t for monitor in seen.monitors if monitor.message == "controller"]
+    assert {after - before for before, after in itertools.pairwise(times)} == {Decimal("0.25")}
+    assert last("controller")["Controller"] == "Executing"
+    motion = last("motion")
+    pose = seen.tractor.drive.pose
+    latitude, longitude = to_degrees(pose.x_m, pose.y_m)
+    assert motion["PositionLatitude"] == pytest.approx(latitude, abs=2e-6)
+    assert motion["PositionLongitude"] == pytest.approx(longitude, abs=2e-6)
+    assert (motion["DriveSpeed"], motion["DriveHeading"], motion["PtoState"], motion["HitchPosition"]) == (3, 0, "On", 0)
+    seen.run(25)
+    assert last("motion")["PositionLatitude"] is None
+    assert last("motion")["PositionFix"] == "NoFix"
+
+
 # --- each fault, its alarm, its repair, its end -------------------------------------------------------------------------------
 
 REPAIRED = ["raised", "repair_started", "repaired", "cleared"]
@@ -211,6 +238,15 @@ def test_a_reset_of_the_vehicles_computer_brakes_and_switches_off(catalog: Catal
     assert reset.tractor.controller == "Ready"
     assert reset.tractor.pto.state in ("Off", "RunningDown")
     assert reset.raised <= {"VehicleSilent"}
+
+
+def test_a_stop_by_switch_is_ended_at_the_machine_and_clears(catalog: Catalog) -> None:
+    faults = ("at 20 s: tractor.stop_switch pressed for 5 s", "at 40 s: tractor.start_button pressed")
+    unit = farm(catalog, *faults, orders=(*WORK, "at 45 s: mission start")).run(30)
+    unit.order("resume")
+    assert unit.run(35).tractor.controller == "Stopped", "not from above"
+    assert unit.run(60).life("UnitStopped") == ["raised", "cleared"]
+    assert unit.kmh == pytest.approx(3)
 
 
 # --- the interlock: nothing moves while somebody may be near ------------------------------------------------------------------
