@@ -1,8 +1,10 @@
 """The shipped air-blast sprayer under level 1: a healthy pass raises nothing; each fault raises its alarms, is repaired, clears."""
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from decimal import Decimal
+from pathlib import Path
 
 import pytest
 
@@ -16,6 +18,7 @@ from level1.catalog import Catalog
 from level1.command import Order
 from level1.eds import parse as parse_eds
 from level1.event import Event, Output, Result, Send
+from level1.frame import Frame, frame_key
 from level1.io import definitions
 from level1.supervisor import Supervisor
 from ucs.main import main
@@ -294,3 +297,28 @@ def test_the_same_seed_gives_the_same_events(catalog: Catalog) -> None:
     def events() -> list[Event]:
         return Orchard(catalog, (SHIPPED / "airblast_sensors.toml").read_text("utf-8")).run(60).events
     assert events() == events()
+
+
+def test_a_recording_tells_of_the_devices_what_was_told_live(catalog: Catalog) -> None:
+    field = Orchard(catalog, (SHIPPED / "airblast_network.toml").read_text("utf-8"))
+    frames: list[Frame] = []
+    field.simulation.on_frame = lambda t_ns, frame: frames.append(Frame(t_ns, frame_key(frame.can_id, frame.extended), frame.data))
+    field.run()
+    replayed = Supervisor(catalog, unit="tractor-7", broadcast=False, armed=(), devices=DEVICES)
+    outputs = [*replayed.receive_many(frames), *replayed.tick(field.simulation.now_ns)]
+
+    def story(events: Sequence[Output]) -> list[tuple[object, ...]]:
+        return [(event.t, event.alarm, event.event, event.text, event.values) for event in events
+                if isinstance(event, Event) and event.alarm in REPORTED]
+    assert story(outputs) == story(field.events)
+    assert len(story(outputs)) > 20
+
+
+def test_the_command_replays_a_recording_of_devices_it_never_heard_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "bus.log"
+    assert main(["simulate", "airblast_network.toml", "--duration", "65 s", "--log", str(log)]) == 0
+    assert main(["replay", str(log), "--dbc", "airblast_sprayer.dbc", "ucs.dbc", "--events", str(tmp_path / "events.jsonl")]) == 0
+    capsys.readouterr()
+    told = [(event["alarm"], event["event"], event["text"]) for event in map(json.loads, (tmp_path / "events.jsonl").open())]
+    assert ("DeviceEmergency", "raised", "node 42: supply voltage (0x3120)") in told
+    assert ("DeviceSilent", "cleared", "") in told
