@@ -55,6 +55,11 @@ class Block:
         return cls(np.array([t_ns for t_ns, _, _ in rows], np.int64), talker, list(numbers), length, head.astype(np.uint64),
                    wide_rows, wide.reshape(len(wide_rows), longest))
 
+    def counts(self) -> list[int]:
+        """How many frames each talker has in the block."""
+        counts: list[int] = np.bincount(self.talker, minlength=len(self.keys)).tolist()
+        return counts
+
     def payload(self, row: int) -> bytes:
         """The payload of one frame."""
         size = int(self.length[row])

@@ -31,10 +31,11 @@ ZONE = _table([w or (Zone.CLEAR if u == T else Zone.NEITHER) for w in range(4) f
 
 class ColumnCondition(NamedTuple):
     """zone(): the zones of an alarm at the slots its columns were last set to; an array, or one number for all. columns: what
-    it reads."""
+    it reads. table: the zone for each class, where it reads the classes of one thing."""
 
     zone: Callable[[], Any]
     columns: tuple[Column, ...]
+    table: Any = None
 
 
 def compile_zone(board: Board, columns: Mapping[Cell, Column], when: Expression, until: Expression | None,
@@ -42,7 +43,12 @@ def compile_zone(board: Board, columns: Mapping[Cell, Column], when: Expression,
     """The zone of an alarm as a function over columns. Raises Unsupported."""
     compiler = _ColumnCompiler(board, columns)
     zone, cells = compiler.zone(when, until, enabled)
-    return ColumnCondition(zone, tuple(compiler.column(cell) for cell in cells))
+    read = tuple(compiler.column(cell) for cell in cells)
+    table = None
+    if len(read) == 1 and not read[0].numeric:
+        read[0].k = np.arange(compiler.classes)
+        table = np.array(np.broadcast_to(zone(), read[0].k.shape))
+    return ColumnCondition(zone, read, table)
 
 
 class _ColumnCompiler(Compiler):
@@ -51,6 +57,7 @@ class _ColumnCompiler(Compiler):
     def __init__(self, board: Board, columns: Mapping[Cell, Column]):
         super().__init__(board, Things())
         self.columns = columns
+        self.classes = 0
         self.names = {"AND": _table(AND), "OR": _table(OR), "NOT": _table(NOT), "ZONE": ZONE, "where": np.where, "judge": judge,
                       "divide": divide, "whole": whole, "ones": ones, "least": least, "largest": largest, "absolute": np.abs}
 
@@ -75,6 +82,7 @@ class _ColumnCompiler(Compiler):
 
     def _table(self, cell: Cell, verdicts: list[int]) -> str:
         self.cells.append(cell)
+        self.classes = len(verdicts)
         return f"{self._name(_table(verdicts))}[{self._name(cell)}.k]"
 
     def _comparison(self, node: Compare) -> str:

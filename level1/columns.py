@@ -59,8 +59,8 @@ class Column:
             self.values = np.array([cell.value])
 
     def at(self, slots: Ints) -> None:
-        """Set what conditions read to what it was at these slots."""
-        chosen: Any = slice(1, None) if slots is self.slots else self.slots.searchsorted(slots, "right")
+        """Set what conditions read to what it was at these slots; slots below 0 stand for what it was before."""
+        chosen = self.slots.searchsorted(slots, "right")
         self.k = self.ks[chosen]
         if self.numeric:
             self.bad = self.bads[chosen]
@@ -108,6 +108,15 @@ class SignalColumn(Column):
         bottom = raw_range(signal)[0]
         self._cuts = np.array([cut - bottom for cut in cell.classes.cuts] if not signal.is_float else [], np.uint64)
         self._qualities = np.array((GOOD, ERROR) if signal.is_float else cell.classes.quality, np.uint8)
+
+    def stays(self, words: Words) -> bool:
+        """Whether the signal stays in its present class through all these frames; a quick look that most signals need."""
+        cell = self.cell
+        if cell.exact or cell.k >= cell.base:
+            return False
+        raws = self.bits.of(words)
+        k, cuts = cell.k, self._cuts
+        return bool((not k or raws.min() >= cuts[k - 1]) and (k == len(cuts) or raws.max() < cuts[k]))
 
     def follow(self, words: Words, short: npt.NDArray[np.bool_] | None, losses: Ints, old: int) -> tuple[Ints, Ints]:
         """Take in the frames of a block whose payload has changed, the first after each loss among them.

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from level1.block import HEAD_BYTES, Block, Ints
 from level1.board import Board, Cell, Page, Watch, Watchdog
+from level1.column_condition import ColumnCondition
 from level1.columns import Column, changed_payloads
 from level1.decode import OLD
 from level1.timer import FAR
@@ -263,6 +264,8 @@ class Passage:
         losses = places.searchsorted(lost_places)
         words = {window: self._block.window(rows, window) for window in {column.bits.window for column in wanted}}
         for column in wanted:
+            if not (passing.short or passing.lost_places) and column.stays(words[column.bits.window]):
+                continue
             short = passing.lengths[places] < column.bits.need if passing.short else None
             keep, at = column.follow(words[column.bits.window], short, losses, column.cell.base + OLD)
             changes = rows[keep]
@@ -289,18 +292,25 @@ class Passage:
             moved = [column for column in condition.columns if column in self._moved]
             slots, outcomes = _NONE, _NONE
             if moved:
-                slots = _union([column.slots for column in moved])
-                for column in condition.columns:
-                    if column not in self._moved:
-                        column.rest()
-                    column.at(slots)
-                zones = np.broadcast_to(condition.zone(), slots.shape)
-                changes = zones != np.concatenate(([watch.outcome], zones[:-1]))
-                slots, outcomes = slots[changes], zones[changes]
+                slots, zones = self._zones(condition, moved)
+                changes = np.flatnonzero(zones[1:] != zones[:-1])
+                slots, outcomes = slots[changes], zones[1:][changes]
                 if len(slots):
                     flips.append((self._rows(slots), watch))
             answers[watch] = Answer(self, watch.outcome, slots.tolist(), outcomes.tolist())
         return answers, flips
+
+    def _zones(self, condition: ColumnCondition, moved: list[Column]) -> tuple[Ints, npt.NDArray[Any]]:
+        """The slots at which an input of a condition changes, and the zones: before the block, and from each of them on."""
+        if condition.table is not None:
+            return moved[0].slots, condition.table[moved[0].ks]
+        slots = _union([column.slots for column in moved])
+        with_before = np.concatenate(([-1], slots))
+        for column in condition.columns:
+            if column not in self._moved:
+                column.rest()
+            column.at(with_before)
+        return slots, np.broadcast_to(condition.zone(), with_before.shape)
 
     # --- in time ----------------------------------------------------------------------------------------------------------
 

@@ -16,32 +16,32 @@ import logging
 import re
 import zlib
 from binascii import unhexlify
-from calendar import timegm
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from level1.frame import BUS_SHIFT, ERROR, EXTENDED, REMOTE, Frame
+from level1.io.candump import LATEST_NS, candump_line, is_candump
 from level1.io.error import OutsideError
-from level1.io.message import CLASSIC_BYTES, FD_BYTES, bounded, flagged_id, from_message
+from level1.io.message import CLASSIC_BYTES, FD_BYTES, flagged_id, from_message
 
 if TYPE_CHECKING:
     import can
+
+    from level1.block import Block
 
 TOLD_LINES = 3
 """How many unreadable lines are told in words; all are counted."""
 HOPELESS_LINES = 1000
 """A file whose first so many lines are all unreadable is given up."""
+BLOCK_ROWS = 1 << 18
+"""Frames in a block: enough that what each block costs does not matter, some tens of megabytes of memory."""
+SINGLE_ROWS = 1 << 14
+"""Frames in a block of a format that is read frame by frame: each is an object first."""
 EPOCH_NS = 1_000_000_000 * 10**9
 """Stamps above (9 September 2001) are UTC; below they count from the recording's start."""
 
-_LOG = re.compile(rb"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]+)#(\S*)(?:\s+[RT])?\s*")
-_SCREEN = re.compile(rb"(?:\(([^)]*)\))?\s*(\S+)\s+(?:(?:RX|TX)\s+\S+\s+\S+\s+)?"
-                     rb"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+\[(\d+)\]\s*(.*)")
-_STAMP = re.compile(rb"(\d+)\.(\d{1,9})")
-_DATE = re.compile(rb"(\d{4})-(\d\d)-(\d\d) (\d\d):(\d\d):(\d\d)\.(\d{1,9})")
-_BYTES = re.compile(rb"((?:[0-9A-Fa-f]{2}(?:\s+|$))*)(?:'.*'|ERRORFRAME)?\s*")
 _ASC_FRAME = re.compile(r"\s*\d+\.\d+\s")
 _GVRET_HEAD = re.compile(rb"Time Stamp,ID,Extended,(Dir,)?Bus,LEN\b")
 _SUFFIXES = (".asc", ".blf", ".csv", ".mf4", ".trc")
@@ -91,20 +91,49 @@ class Log:
 
     def frames(self) -> Iterator[Frame]:
         """The frames in the order of the file. Raises LogError at the end when there was none."""
+        with self._reading():
+            for frame in self._read():
+                if not self.frames_read:
+                    self.first_ns = self.last_ns = frame.t_ns
+                elif frame.t_ns > self.last_ns:
+                    self.last_ns = frame.t_ns
+                self.frames_read += 1
+                yield frame
+
+    def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[Block]:
+        """The frames in columns, so many rows a block or somewhat more; otherwise as `frames`."""
+        with self._reading():
+            for block in self._read_blocks(rows):
+                if not self.frames_read:
+                    self.first_ns = self.last_ns = int(block.t_ns[0])
+                self.last_ns = max(self.last_ns, int(block.t_ns.max()))
+                self.frames_read += len(block)
+                yield block
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
         with self._raw:
             try:
-                for frame in self._read():
-                    if not self.frames_read:
-                        self.first_ns = self.last_ns = frame.t_ns
-                    elif frame.t_ns > self.last_ns:
-                        self.last_ns = frame.t_ns
-                    self.frames_read += 1
-                    yield frame
+                yield
             except (EOFError, OSError, zlib.error) as error:
                 self._skip(f"the file ends in the middle or is damaged: {error}")
         if not self.frames_read:
             reason = f"no readable frame; {self.complaints[0]}" if self.complaints else "holds no frame"
             raise LogError(f"{self.path}: {reason}")
+
+    def _read_blocks(self, rows: int) -> Iterator[Block]:
+        from level1.block import Block
+        if self._read == self._candump:
+            from level1.io.candump_blocks import CandumpBlocks
+            for block in CandumpBlocks(self._file, self.bus, self._skip).blocks(rows):
+                counts = block.counts()
+                self.error_frames += sum(count for key, count in zip(block.keys, counts, strict=True) if key & ERROR)
+                self.remote_frames += sum(count for key, count in zip(block.keys, counts, strict=True) if key & REMOTE)
+                yield block
+            return
+        frames = self._read()
+        while batch := list(itertools.islice(frames, min(rows, SINGLE_ROWS))):
+            yield Block.of(batch)
 
     def batches(self, size: int = 4096) -> Iterator[list[Frame]]:
         """The frames in lists of at most `size`."""
@@ -135,7 +164,7 @@ class Log:
             return self._gvret
         if suffix:
             return lambda: self._python_can(suffix)
-        if any(_LOG.fullmatch(line) or _SCREEN.fullmatch(line.strip()) for line in head.splitlines()):
+        if any(map(is_candump, head.splitlines())):
             return self._candump
         raise LogError(f"{self.path}: no recording of a known format; {_HINT}")
 
@@ -150,10 +179,11 @@ class Log:
         for number, line in enumerate(self._file, 1):
             try:
                 stamp, channel, body = line.split()
-                name, _, payload = body.partition(b"#")
+                name, mark, payload = body.partition(b"#")
                 key = keys[channel][name]
                 data = unhexlify(payload)
-                if len(data) <= CLASSIC_BYTES and stamp[-8] == 46 and stamp[1:-8].isdigit() and stamp[-7:-1].isdigit():
+                is_common = mark and len(data) <= CLASSIC_BYTES and len(stamp) < 20 and b"(0" <= stamp < b"(92"
+                if is_common and stamp[-8::7] == b".)" and stamp[1:-8].isdigit() and stamp[-7:-1].isdigit():
                     yield Frame(int(stamp[1:-8]) * 10**9 + int(stamp[-7:-1]) * 1000, key, data)
                     continue
             except (ValueError, KeyError, IndexError):
@@ -186,7 +216,7 @@ class Log:
                 can_id = flagged_id(int(cells[1], 16), cells[2].strip().lower() == b"true")
                 if len(data) != size or size > FD_BYTES:
                     raise ValueError(f"{len(data)} of {size} data bytes")
-                if not cells[0].isdigit():
+                if not cells[0].isdigit() or int(cells[0]) * 1000 > LATEST_NS:
                     raise ValueError("no time stamp in microseconds")
                 yield self._counted(int(cells[0]) * 1000, can_id | self.bus(cells[bus].decode()) << BUS_SHIFT, data)
             except (ValueError, IndexError) as error:
@@ -296,77 +326,6 @@ class _Lines:
                 return head, [line]
             head.append(line)
         return head, []
-
-
-def candump_line(line: bytes) -> tuple[int, bytes, int, bytes]:
-    """Time stamp in ns, channel, identifier with its flags (`Frame.key` without a bus) and data of a candump line.
-
-    Raises ValueError with what is wrong.
-    """
-    if match := _LOG.fullmatch(line):
-        seconds, fraction, channel, name, payload = match.groups()
-        return _nanoseconds(seconds, fraction), channel, *_log_frame(name, payload)
-    if match := _SCREEN.fullmatch(line):
-        stamp, channel, name, length, rest = match.groups()
-        return _stamp(stamp), channel, *_screen_frame(name, length, rest)
-    raise ValueError("not candump text")
-
-
-def _log_frame(name: bytes, payload: bytes) -> tuple[int, bytes]:
-    """Flagged identifier and data of `ID#DATA`, `ID#R`, `ID##FDATA` (can-utils, lib.h)."""
-    can_id = _spelled_id(name)
-    if payload.startswith(b"#"):
-        return can_id, _data(payload[2:], FD_BYTES)
-    if payload[:1] in (b"R", b"r"):
-        return can_id | REMOTE, b""
-    return can_id, _data(payload.split(b"_")[0], CLASSIC_BYTES)
-
-
-def _screen_frame(name: bytes, length: bytes, rest: bytes) -> tuple[int, bytes]:
-    """Flagged identifier and data of `ID [8] 11 22 …`; a length in two digits is CAN FD's."""
-    can_id = _spelled_id(name)
-    if rest.startswith(b"remote request"):
-        return can_id | REMOTE, b""
-    match = _BYTES.fullmatch(rest)
-    if not match:
-        raise ValueError("data bytes are not hexadecimal")
-    data = _data(b"".join(match[1].split()), FD_BYTES if len(length) > 1 else CLASSIC_BYTES)
-    if len(data) != int(length):
-        raise ValueError(f"{len(data)} of {int(length)} data bytes")
-    return can_id, data
-
-
-def _spelled_id(name: bytes) -> int:
-    """Identifier with the flags that its spelling means: 3 digits standard, 8 extended or an error frame."""
-    value = int(name, 16)
-    if len(name) == 8 and value >> 29 == 1:
-        return value
-    if len(name) not in (3, 8):
-        raise ValueError(f"the identifier {name.decode()} has {len(name)} digits; candump writes 3 or 8")
-    return flagged_id(value, len(name) == 8)
-
-
-def _data(digits: bytes, limit: int) -> bytes:
-    try:
-        data = unhexlify(digits)
-    except ValueError:
-        raise ValueError("data bytes are not pairs of hexadecimal digits") from None
-    return bounded(data, limit)
-
-
-def _nanoseconds(seconds: bytes, fraction: bytes) -> int:
-    return int(seconds) * 10**9 + int(fraction.ljust(9, b"0"))
-
-
-def _stamp(text: bytes | None) -> int:
-    """Nanoseconds of a screen stamp: seconds, or a date and time, which is taken as UTC."""
-    if text is None:
-        raise ValueError("no time stamp; record with `candump -L` or `candump -ta`")
-    if match := _STAMP.fullmatch(text):
-        return _nanoseconds(*match.groups())
-    if match := _DATE.fullmatch(text):
-        return _nanoseconds(b"%d" % timegm((*map(int, match.groups()[:6]), 0, 0, 0)), match[7])
-    raise ValueError(f'unreadable time stamp "{text.decode("ascii", "replace")}"')
 
 
 def stamp_ns(stamp_s: float) -> int:

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from level1.frame import ERROR, EXTENDED, REMOTE, Frame, frame_key
-from level1.io.replay import Log, LogError, candump_line
+from level1.io.candump import candump_line
+from level1.io.replay import Log, LogError
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 LINE = b"(1700000000.004100) can0 0CF00400#F0FFA1161CFFFFFF\n"
@@ -73,7 +74,7 @@ def test_the_screen_form_of_candump(tmp_path: Path, line: bytes, key: int, data:
     (b"1700000000.004100123", 1_700_000_000_004_100_123),
     (b"0000000000.352000", 352_000_000),
     (b"0.0", 0),
-    (b"9999999999.999999", 9_999_999_999_999_999_000),
+    (b"9223372036.854775", 9_223_372_036_854_775_000),
 ])
 def test_stamps_are_exact(tmp_path: Path, stamp: bytes, t_ns: int) -> None:
     assert [frame.t_ns for frame in frames(tmp_path, b"(" + stamp + b") can0 123#\n" * 2)[:1]] == [t_ns]
@@ -104,6 +105,8 @@ def test_no_content_crashes_the_reader(tmp_path_factory: pytest.TempPathFactory,
 @pytest.mark.parametrize(("line", "reason"), [
     (b"(1700000000.0041", "not candump text"),
     (b"nonsense", "not candump text"),
+    (b"(1700000000.004100) can0 0CF00400", "not candump text"),
+    (b"(1700000000.004100g can0 0CF00400#11", "not candump text"),
     (b"(1700000000.004100) can0 123#112", "data bytes are not pairs of hexadecimal digits"),
     (b"(1700000000.004100) can0 123#GG", "data bytes are not pairs of hexadecimal digits"),
     (b"(1700000000.004100) can0 0CEFFF00#FF0028FF07FFFFFF6406377DFFFFFFFF",
@@ -115,6 +118,7 @@ def test_no_content_crashes_the_reader(tmp_path_factory: pytest.TempPathFactory,
     (b"(1700000000.004100)  can0  123   [3]  11 22", "2 of 3 data bytes"),
     (b"(1700000000.004100)  can0  123   [3]  11 22 3", "data bytes are not hexadecimal"),
     (b"  can0  123   [1]  11", "no time stamp; record with `candump -L` or `candump -ta`"),
+    (b"(9223372036.854776) can0 123#00", "time stamp 9223372036 out of range"),
     (b"(yesterday)  can0  123   [1]  11", 'unreadable time stamp "yesterday"'),
 ])
 def test_an_unreadable_line_is_skipped_counted_and_told(tmp_path: Path, line: bytes, reason: str) -> None:
