@@ -4,6 +4,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import socket
 import struct
@@ -18,7 +19,7 @@ from typing import Any
 import pytest
 
 from hil_tests.conftest import ROOT, Process
-from level1.decode import encode
+from level1.decode import encode, raw_of
 from level1.frame import ERROR, EXTENDED
 from level1.io.definitions import load
 
@@ -44,6 +45,7 @@ path = "journal.db"
 """
 BABBLER = 0x18FE_F1AA
 ROUNDS = 100
+SAMPLES = 150
 SEED = 20_261_122
 
 
@@ -214,3 +216,27 @@ def test_plugs_pulled_a_hundred_times_leave_a_supervisor_that_works_and_a_journa
     for pulled, plugged in zip(pulled_ns, plugged_ns, strict=True):
         assert any(begin <= pulled + IN_TIME_S * 1e9 and end >= plugged for begin, end in gaps), "a pull that nobody was told of"
     print(f"{ROUNDS} plugs pulled; {len(gaps)} gaps told, {sum(end - begin for begin, end in gaps) / 1e9:.1f} s in all")
+
+
+def test_the_time_from_a_frame_to_raised_on_the_wire_and_the_memory_of_level_1(run: Process, plug: Plug) -> None:
+    """Told, not judged: what else the machine does decides about the worst."""
+    catalog = load(["flaming_tool.dbc"])
+    status, alarms = catalog.messages["FLAMER_STATUS"], catalog.messages["FLAMER_ALARMS"]
+    word = {name: raw for raw, name in status.signal("Safeguard").choices.items()}["CommandsLost"]
+    delays_ms = []
+    with Wire() as wire:
+        wire.sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", alarms.can_id, 0x7FF))
+        wire.sock.settimeout(2)
+        for turn in range(2 * SAMPLES):
+            lost = turn % 2 == 0
+            begin_ns = time.monotonic_ns()
+            wire.send(status.can_id, encode(status, {"Safeguard": word if lost else 0, "AliveCounter": turn % 4}, None))
+            while bool(raw_of(alarms.signal("FlamerCommandsLost"), wire.sock.recv(16)[8:])) is not lost:
+                pass
+            delays_ms.append((time.monotonic_ns() - begin_ns) / 1e6)
+            time.sleep(0.03)
+    delays_ms.sort()
+    resident = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{run.pid}/status").read_text())
+    assert resident is not None
+    print(f"frame to alarm on the wire: p50 {delays_ms[SAMPLES]:.1f} ms, p99 {delays_ms[2 * SAMPLES * 99 // 100]:.1f} ms, "
+          f"worst {delays_ms[-1]:.1f} ms; `ucs run` takes {int(resident[1]) / 1000:.1f} MB")

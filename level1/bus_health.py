@@ -189,12 +189,13 @@ class BusHealth:
             yield from self._quieter(t_ns, LOST, self.name)
 
     def _judge_unsent(self, t_ns: int, unsent: Mapping[str, int], sent: int) -> Iterable[Report]:
-        if self._down_ns is not None:  # one cause, one alarm: what could not be sent stands in its values
+        silenced = DOWN if self._down_ns is not None else OFF if self._state == "BusOff" else None
+        if silenced is not None:  # one cause, one alarm: what could not be sent stands in its values
             if unsent:
-                detail = self._detail[DOWN, self.name]
+                detail = {name: value for name, value in self._detail[silenced, self.name].items() if name != "Bus"}
                 total = Counter(detail.get("NotSent", {}))
                 total.update(unsent)
-                yield self._there(t_ns, DOWN, "", {**detail, "NotSent": dict(total)}, self._text[DOWN, self.name])
+                yield self._there(t_ns, silenced, "", {**detail, "NotSent": dict(total)}, self._text[silenced, self.name])
         elif unsent:
             total = Counter(self._detail.get((UNSENT, self.name), {}).get("NotSent", {}))
             total.update(unsent)

@@ -42,6 +42,12 @@ class TestInterface:
         assert (over.present, over.detail["AwaySeconds"], over.detail["Reason"]) == (False, 2.5, "No such device")
         assert bus.state == "BusActive" and bus.up(4 * S) == []
 
+    def test_bus_off_says_what_could_not_be_sent_too(self, bus: BusHealth) -> None:
+        bus.error(S, BUS_OFF, bytes(8))
+        assert brief(bus.window(2 * S, Traffic({}, unsent={"CMD": 3}))) == [("CanBusOff", "implement", True)]
+        over, = bus.heard(3 * S)
+        assert over.detail == {"Bus": "implement", "Channel": "can0", "NotSent": {"CMD": 3}}
+
     def test_what_could_not_be_sent_meanwhile_stands_in_its_values_and_is_no_second_alarm(self, bus: BusHealth) -> None:
         bus.down(S, "No such device")
         told = [*bus.window(2 * S, Traffic({}, unsent={"CMD": 3})), *bus.window(3 * S, Traffic({}, unsent={"CMD": 1, "ALARMS": 2}))]
