@@ -45,11 +45,12 @@ class Host(Protocol):
         """Why no repair of this kind may act now (stopped, paused from above); empty when it may."""
 
 
-IDLE, RUNNING, PAUSING, WAITING = range(4)
+IDLE, RUNNING, PAUSING, WAITING, SETTLING = range(5)
 
 
 class RepairMachine:
-    """The repair of one alarm at run time. phase: IDLE, RUNNING (a step waits), PAUSING (between attempts), WAITING (may not act).
+    """The repair of one alarm at run time. phase: IDLE, RUNNING (a step waits), PAUSING (between attempts), WAITING (may not act),
+    SETTLING (the condition is back after a repair, before the alarm has cleared: it must hold for the on-delay again).
 
     begun_ns: when the attempts within the window began. attempt: number of the present or last attempt of this activation.
     expects: a closure with the verdict for each expect step; feedback(): worst verdict of all of them, unknown or not.
@@ -103,6 +104,13 @@ class RepairMachine:
         if self.phase == RUNNING:
             if self.alarm.zone in (Zone.STALE, Zone.ERROR):
                 self.fail(t_ns, "its inputs are missing or wrong")
+        elif self.phase == SETTLING:
+            if self.alarm.zone != Zone.RAISE:
+                self.due = FAR
+                self.phase = IDLE
+        elif self.phase == IDLE and self.attempt and self.alarm.zone == Zone.RAISE and self.alarm.definition.on_delay_ns:
+            self.phase = SETTLING
+            self.timers.set(self, t_ns + self.alarm.definition.on_delay_ns)
         elif self.phase != PAUSING:
             self.consider(t_ns)
 
@@ -142,8 +150,8 @@ class RepairMachine:
 
     def expire(self, now_ns: int) -> None:
         """A wait is over, an expect has run out, or the pause between attempts has passed."""
-        if self.phase == PAUSING:
-            self.phase = WAITING
+        if self.phase in (PAUSING, SETTLING):
+            self.phase = WAITING if self.phase == PAUSING else IDLE
             self.consider(now_ns)
             return
         step = self.definition.steps[self.position]

@@ -399,7 +399,11 @@ class Supervisor:
                 if self.catalog.messages[name].sent_by_ucs}
 
     def _make_samplers(self, period_ns: int) -> list[_Sampler]:
-        return [_Sampler(self, message, period_ns) for message in self.catalog.messages.values() if message.monitor_as]
+        parts: dict[str, list[Message]] = {}
+        for message in self.catalog.messages.values():
+            if message.monitor_as:
+                parts.setdefault(message.monitor_as, []).append(message)
+        return [_Sampler(self, name, messages, period_ns) for name, messages in parts.items()]
 
     # --- what alarms and repairs ask for (alarm.Host, repair.Host) ----------------------------------------------------------
 
@@ -631,15 +635,18 @@ class _Broadcast:
 
 
 class _Sampler:
-    """A monitoring message, sampled at a fixed rate without drift."""
+    """A monitoring message, sampled at a fixed rate without drift. Several messages may form one (`MonitorAs`); a signal name
+    that two of them have carries its message there."""
 
-    def __init__(self, supervisor: Supervisor, message: Message, period_ns: int):
+    def __init__(self, supervisor: Supervisor, name: str, messages: Sequence[Message], period_ns: int):
         self.supervisor = supervisor
-        self.message = message
+        self.name = name
         self.period_ns = period_ns
         self.order = supervisor.timers.order()
         self.due = FAR
-        self.cells = [(signal.name, supervisor.board.cell(message.name, signal.name)) for signal in message.signals]
+        counts = Counter(signal.name for message in messages for signal in message.signals)
+        self.cells = [(signal.name if counts[signal.name] == 1 else f"{message.name}.{signal.name}",
+                       supervisor.board.cell(message.name, signal.name)) for message in messages for signal in message.signals]
 
     def expire(self, now_ns: int) -> None:
         """Take a sample of all values, each with its age and quality."""
@@ -653,7 +660,7 @@ class _Sampler:
             ages[name] = None if cell.page.level < 0 else (now_ns - cell.page.t_ns) / 1e9
             quality[name] = QUALITY_WORDS[grade]
         supervisor._out.append(Monitor(supervisor.unit, supervisor.boot, seconds(now_ns), supervisor.utc(now_ns),
-                                       supervisor.utc_trusted, self.message.monitor_as, values, ages, quality))
+                                       supervisor.utc_trusted, self.name, values, ages, quality))
         supervisor.timers.set(self, now_ns + self.period_ns)
 
 

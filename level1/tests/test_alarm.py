@@ -7,7 +7,7 @@ from decimal import Decimal
 import pytest
 
 from level1.command import Order
-from level1.event import Event, Result, encode
+from level1.event import Event, Monitor, Result, encode
 from level1.expression import AlarmState, And, Compare, Count, Elapsed, Number, Quality, Silent
 from level1.frame import EXTENDED, REMOTE, Frame
 from level1.supervisor import Supervisor
@@ -155,6 +155,18 @@ def test_alarm_messages_go_out_at_every_change_and_at_their_cycle() -> None:
     target = supervisor([TANK], [alarm("Low", LOW), alarm("Empty", compare("TANK.Level", "<", 5), 2)], broadcast=True)
     outputs = target.receive_many([frame(0, TANK, 50), frame(2500 * MS, TANK, 10)])
     assert [(send.t_ns / SECOND, send.data[0]) for send in sends(outputs, "ALARMS")] == [(0, 0), (1, 0), (2, 0), (2.5, 1)]
+
+
+def test_messages_that_form_one_monitoring_message_are_sampled_together_at_the_period() -> None:
+    one = message("ONE", 0x10, [signal("Speed", 0, 8), signal("Own", 8, 8)], monitor_as="motion")
+    two = message("TWO", 0x11, [signal("Speed", 0, 8), signal("Heading", 8, 8)], monitor_as="motion")
+    target = supervisor([one, two], [], monitor_ns=250 * MS, start_ns=0)
+    outputs = target.receive_many([frame(0, one, 3, 4), frame(100 * MS, two, 5, 6)])
+    samples = [out for out in [*outputs, *target.tick(SECOND)] if isinstance(out, Monitor)]
+    assert [float(sample.t) for sample in samples] == [0, 0.25, 0.5, 0.75, 1]
+    assert samples[1].message == "motion" and samples[1].values == {"ONE.Speed": 3, "Own": 4, "TWO.Speed": 5, "Heading": 6}
+    assert samples[1].age_s["Heading"] == 0.15 and samples[0].quality["Heading"] == "never"
+    assert samples[-1].quality["Heading"] == "stale" and samples[-1].values["Heading"] is None
 
 
 ANY = message("ENGINE", 0x0CF004FE, [signal("Speed", 24, 16)], extended=True, j1939=True, pgn=0xF004)

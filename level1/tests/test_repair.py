@@ -342,6 +342,21 @@ def test_a_harmless_repair_is_tried_again_from_what_was_commanded_before_it() ->
     assert {send.data[0] for send in sent if send.t_ns > lock_out * SECOND} == {0}
 
 
+def test_a_flame_lost_again_before_the_alarm_has_cleared_must_be_lost_for_the_on_delay_again() -> None:
+    tool = Flamer(supervisor([STATUS, COMMAND], [pilot_flame_out(off_delay_ns=5 * SECOND)]))
+    tool.run(1)
+    tool.flame = 0
+    tool.run(31)
+    assert words(events(tool.outputs))[-1] == "repaired"
+    tool.flame = 0
+    tool.run(0.2)
+    tool.flame = 1
+    assert tool.run(1) == []
+    tool.flame = 0
+    lost = tool.now / SECOND
+    assert tool.run(1) == [(round(lost + 0.3, 9), "PilotFlameOut", "repair_started")]
+
+
 def test_a_stranger_on_a_held_message_does_not_get_into_the_repair() -> None:
     tool = flamer()
     tool.flame = 0
