@@ -22,7 +22,7 @@ from ucs import inputs
 from ucs.inputs import Input
 from ucs.trace import Line, Trace
 
-MOST_ALARMS, MOST_LANES = 14, 16
+MOST_ALARMS, MOST_LANES = 14, 18
 """Drawn at most; what is left out is said."""
 WIDTH_IN, DPI = 12.0, 110
 LANE_IN, STATE_IN, ALARM_IN, PATH_IN = 0.50, 0.17, 0.30, 5.6
@@ -141,16 +141,23 @@ def _story(told: Sequence[Event], origin_ns: int, length_s: float) -> Story:
 
 
 def lanes(trace: Trace, alarms: Sequence[str]) -> list[Lane]:
-    """The lanes for these alarms; for none the signals of all alarms that changed."""
+    """The lanes for these alarms. Where none of them is a fault, also what changed of the others' signals: first those that
+    are compared with what was commanded."""
     catalog, lines = trace.catalog, trace.lines()
-    chosen = [catalog.alarms[name] for name in alarms if name in catalog.alarms] or list(catalog.alarms.values())
-    pairs = {pair for alarm in chosen for pair in _pairs(alarm, catalog)}
+    chosen = [catalog.alarms[name] for name in alarms if name in catalog.alarms]
+    own = [place for alarm in chosen for place in inputs.of_alarm(alarm)]
+    others: list[Input] = []
+    if not any(alarm.is_fault for alarm in chosen):
+        chosen = list(catalog.alarms.values())
+        others = [place for alarm in chosen for place in inputs.of_alarm(alarm) if place in lines and _changes(lines[place])]
+    pairs = [pair for alarm in chosen for pair in sorted(_pairs(alarm, catalog))]
     partner = {actual: expected for actual, expected in pairs if actual in lines and expected in lines}
+    others.sort(key=lambda place: place not in partner)
     found: dict[Input, Lane] = {}
-    for place in (place for alarm in chosen for place in inputs.of_alarm(alarm)):
-        if place in lines and place not in partner.values() and (alarms or _changes(lines[place])):
+    for place in (*own, *others):
+        if place in lines and place not in partner.values():
             expected = partner.get(place)
-            looking = frozenset(alarm.name for alarm in chosen if {place, expected} & set(inputs.of_alarm(alarm)))
+            looking = frozenset(alarm.name for alarm in chosen if not {place, expected}.isdisjoint(inputs.of_alarm(alarm)))
             found.setdefault(place, Lane(lines[place], lines[expected] if expected else None, looking))
     return list(found.values())
 
