@@ -104,7 +104,7 @@ class AirblastMission(Node):
             return None
         if message == "AIRBLAST_CMD":
             return {"AirblastWanted": "On" if self._spraying else "Off", "NozzleMode": self._nozzles, "TurnMode": self._turning,
-                    "AirblastFlowWanted": self._flow}
+                    "Retry": "Off", "AirblastFlowWanted": self._flow}
         if not self._starts:
             return None
         device = next(iter(self._starts))

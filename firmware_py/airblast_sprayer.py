@@ -5,7 +5,8 @@ its ultrasonic sensor works, was heard within 700 ms, and sees something within 
 its sensor sees nothing, and back when it does.
 
 Every tick of 20 ms: sensors → work mode, main valve, nozzles, angles → plant. Commands are cyclic (RPDO 1); when they stop for the
-time of its event timer, 400 ms, the main valve closes, and an emergency says so.
+time of its event timer, 400 ms, the main valve closes, and an emergency says so. Work begins or ends with one try a command; one
+more is made on Retry only.
 """
 from __future__ import annotations
 
@@ -39,7 +40,8 @@ UPPER, LOWER = (0, 4), (3, 7)
 ANGLES = {0: "AngleLeftUpper", 3: "AngleLeftLower", 4: "AngleRightUpper", 7: "AngleRightLower"}
 COMMANDS_LOST, TANK_EMPTY = 0x8250, 0xFF10
 """Error codes."""
-IDLE: dict[str, Value] = {"AirblastWanted": "Off", "NozzleMode": "Automatic", "TurnMode": "Automatic", "AirblastFlowWanted": 0}
+IDLE: dict[str, Value] = {"AirblastWanted": "Off", "NozzleMode": "Automatic", "TurnMode": "Automatic", "Retry": "Off",
+                          "AirblastFlowWanted": 0}
 """What counts as commanded until someone commands."""
 
 
@@ -75,7 +77,7 @@ class AirblastSprayer(CanopenNode):
         chosen = {setting.name: setting.default for setting in self.SETTINGS} | dict(settings)
         self.plant = AirblastPlant(random, chosen["tank_volume"], chosen["tank_level"], self.TICK_NS / 1e9)
         self._command_timeout_ns = int(self.device.rpdo[1].event_timer) * 1_000_000
-        self._mode = Actuator("Off", MODE_NS)
+        self._mode = Actuator("Off", MODE_NS, retry_ns=None)
         self._valve = Actuator("Closed", VALVE_NS)
         self._nozzles = tuple(Actuator("Closed", round(random.uniform(*NOZZLE_RESPONSE_S) * 1e9)) for _ in range(NOZZLES))
         self._angles = dict.fromkeys(ANGLES, 0.0)
@@ -92,12 +94,14 @@ class AirblastSprayer(CanopenNode):
         self._states: Mapping[str, Value] = {}
         self._states_ns = 0
         self._state = "Idle"
+        self._retries = False
 
     # --- protocol ---------------------------------------------------------------------------------------------------------
 
     def hear(self, t_ns: int, message: str, values: Mapping[str, Value]) -> None:
         """A command, or what the sensors say."""
         if message == "AIRBLAST_CMD":
+            self._retries = values["Retry"] == "On" and self._command["Retry"] != "On"
             self._command = values
             self._commanded_ns = t_ns
         elif message == "US_STATE":
@@ -115,9 +119,13 @@ class AirblastSprayer(CanopenNode):
         self._watch(fresh)
         wanted = fresh and self._command["AirblastWanted"] == "On" and self._state != "TankEmpty"
         if not self.powered or self._state in ("CommandsLost", "TankEmpty"):
+            self._mode.advance(t_ns, "Off")
             self._mode.force("Off")
         elif not self._frozen:
             self._mode.advance(t_ns, "On" if wanted else "Off")
+            if self._retries:
+                self._retries = False
+                self._mode.again(t_ns)
         was_open = self._valve.position == "Open"
         self._valve.advance(t_ns, "Open" if self._mode.position == "On" else "Closed")
         if self._valve.position == "Open" and not was_open:
@@ -195,7 +203,6 @@ class AirblastSprayer(CanopenNode):
     def reboot(self, t_ns: int) -> None:
         """The program begins anew: off, and nothing heard."""
         self._forget()
-        self._mode.force("Off")
 
     # --- faults -----------------------------------------------------------------------------------------------------------
 
