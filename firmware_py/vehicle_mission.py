@@ -26,6 +26,8 @@ HOLDS: Mapping[str, str] = {
     "ImplementSetUnsetFailure": "VEHICLE_IMPLEMENT_CMD"}
 """Which alarm's repair holds which command."""
 SILENT_NS = 1_000_000_000
+HARMLESS_NS = 600_000_000
+"""For so long, three cycles, Off, Unset and Hold are sent before anything else, once the vehicle takes orders again."""
 RAISED, LOWERED = 100.0, 0.0
 LIMITS_KMH = {"slow": 1.0, "normal": 6.0}
 
@@ -71,6 +73,7 @@ class VehicleMission(Node):
         self._hitch: str | None = None
         self._status: Mapping[str, Value] = {}
         self._heard_ns: int | None = None
+        self._harmless_until_ns = start_ns
         self._counter = 0
         self._once: list[str] = []
 
@@ -98,6 +101,8 @@ class VehicleMission(Node):
         """Status, alarms, or what the UCS requests of the vehicle."""
         match message:
             case "VEHICLE_STATUS":
+                if self._heard_ns is None or t_ns - self._heard_ns >= SILENT_NS:
+                    self._harmless_until_ns = t_ns + HARMLESS_NS
                 self._heard_ns = t_ns
                 self._heed(t_ns, values)
                 self._status = values
@@ -109,6 +114,8 @@ class VehicleMission(Node):
     def _heed(self, t_ns: int, status: Mapping[str, Value]) -> None:
         """What must not come back by itself is withdrawn."""
         held = status["Controller"] in HELD
+        if held or status["EngineState"] == "Off":
+            self._harmless_until_ns = t_ns + HARMLESS_NS
         if held:
             self._withdraw_all(t_ns, str(status["Controller"]).lower())
         elif self._pto and status["EngineState"] == "Off":
@@ -175,19 +182,21 @@ class VehicleMission(Node):
         """The commands; None for what level 1 holds, and for the sign of life when nothing is heard of the vehicle."""
         if self._obedient and message in self.held:
             return None
+        now_ns = self._next_tick_ns - self.TICK_NS
+        harmless = self._heard_ns is None or now_ns < self._harmless_until_ns
         match message:
             case "VEHICLE_GUIDE":
-                now_ns = self._next_tick_ns - self.TICK_NS
                 if self._heard_ns is None or now_ns - self._heard_ns >= SILENT_NS:
                     return None
                 self._counter = (self._counter + 1) % 16
                 return {"GuideCounter": self._counter}
             case "VEHICLE_PTO_CMD":
-                return {"PtoWanted": "On" if self._pto else "Off", "Retry": "Off"}
+                return {"PtoWanted": "On" if self._pto and not harmless else "Off", "Retry": "Off"}
             case "VEHICLE_HITCH_CMD":
-                return {"HitchMove": "Hold" if self._hitch is None else "Move", "Retry": "Off", "HitchWanted": self._hitch_wanted}
+                holds = harmless or self._hitch is None
+                return {"HitchMove": "Hold" if holds else "Move", "Retry": "Off", "HitchWanted": self._hitch_wanted}
             case _:
-                return {"ImplementWanted": "Set" if self._implement else "Unset", "Retry": "Off"}
+                return {"ImplementWanted": "Set" if self._implement and not harmless else "Unset", "Retry": "Off"}
 
     @property
     def _hitch_wanted(self) -> float:

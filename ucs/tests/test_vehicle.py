@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
+from random import Random
 
 import pytest
 import serial
@@ -15,6 +16,7 @@ from firmware_py.field import CELL_M, LENGTH_M, Pose, WeedMap, paper_map, to_deg
 from firmware_py.scenario import build, parse
 from firmware_py.sprayer_boom import SprayerBoom
 from firmware_py.vehicle import UTC_START_NS, Vehicle
+from firmware_py.vehicle_mission import VehicleMission
 from firmware_py.virtual_bus import Simulation
 from level1.catalog import Catalog
 from level1.command import Order
@@ -149,6 +151,25 @@ def cells_under(boom: SprayerBoom, pose: Pose, weeds: WeedMap) -> Iterator[tuple
         y_m = pose.y_m - 2 * math.cos(heading) - math.sin(heading) * right_m
         if is_open and 0 <= y_m < LENGTH_M:
             yield (int(x_m / CELL_M), int(y_m / CELL_M)), weeds.weed(x_m, y_m)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 17, 21, 27, 33, 36])
+def test_no_sequence_of_orders_raises_an_alarm_of_a_healthy_vehicle(catalog: Catalog, seed: int) -> None:
+    """Whoever orders what and when, down to the tenth of a second: a stop is told, and nothing else."""
+    dice = Random(seed)
+    orders, faults, t_s = [], [], 0.0
+    while t_s < 150:
+        device, action = dice.choice([(phrase.device, phrase.action) for phrase in VehicleMission.ORDERS])
+        orders.append(f"at {t_s:.1f} s: {device} {action}")
+        if dice.random() < 0.1:
+            faults.append(f"at {t_s:.1f} s: tractor manual for 5 s")
+        if dice.random() < 0.1:
+            faults.append(f"at {t_s:.1f} s: tractor.stop_switch pressed for 4 s")
+        if dice.random() < 0.1:
+            faults.append(f"at {t_s:.1f} s: tractor.start_button pressed")
+        t_s += dice.choice([0.1, 0.3, 1.0, 4.0, 12.0])
+    busy = farm(catalog, *faults, orders=orders, duration="3 min").run()
+    assert busy.raised <= {"UnitStopped"}
 
 
 # --- monitoring ---------------------------------------------------------------------------------------------------------------
