@@ -12,6 +12,7 @@ while the program runs. From then on its heartbeat must come:
 - After a command to reset, the device has `BOOT_NS` to come back. A device that sends no heartbeat is not missed.
 - An emergency stays until the device says that it is over (error code 0x00xx) or has booted: both forget all its errors. When the
   error register that comes with 0x00xx still has bits set, only the errors are over whose own bit is not among them.
+- A silent device that was taken off on purpose is forgotten when someone at the machine says so (reset of `DeviceSilent`).
 - Answers to others who read the error history (object 0x1003 by SDO) are taken along with the emergencies.
 
 The identifiers of heartbeats and emergencies mean that only on a CANopen bus. A bus is one when it has a configured device, or
@@ -241,6 +242,23 @@ class Devices:
         """How to call a device in a text."""
         device = self._known.get((bus, node))
         return f"{device.name} (node {node})" if device is not None and device.name else f"node {node}"
+
+    def taken_off(self, t_ns: int) -> str:
+        """Someone at the machine says that the silent devices were taken off on purpose: they are forgotten until they are heard again.
+
+        Gives the reason of a refusal: there is none, or one of them must be there.
+        """
+        silent = [(int(bus), int(node)) for bus, node in (key.split("/") for key in self._host.causes(DEVICE_SILENT))]
+        needed = [place for place in silent if (device := self._known.get(place)) is not None and device.required]
+        for bus, number in silent:
+            if (bus, number) not in needed:
+                node = self._nodes.pop((bus, number), None)
+                if node is not None:
+                    node.due = FAR
+                self._host.report(t_ns, DEVICE_SILENT, f"{bus}/{number}", False, {}, "")
+        if needed:
+            return f"{', '.join(self.name(*place) for place in needed)} must be there by the configuration"
+        return "" if silent else "no device is silent"
 
     # --- what is heard ----------------------------------------------------------------------------------------------------
 

@@ -522,6 +522,8 @@ class Supervisor:
         repair = machine.definition.repair
         if order.origin == "above" and (repair is None or repair.local_reset):
             return f"{order.target} can only be reset at the machine"
+        if order.target == DEVICE_SILENT and self._devices is not None:
+            return self._devices.taken_off(self.now_ns)
         return machine.reset(self.now_ns, who)
 
     def _command_payload(self, command: Command, order: Order) -> bytes:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from hypothesis import given, settings
@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from level1.canopen import BOOT_NS, ERRORS, MARGIN, MAX_ERRORS, Device, describe, outlives, parse_emergency
 from level1.catalog import Message, Repair
-from level1.event import Event, Output
+from level1.command import Order
+from level1.event import Event, Output, Result
 from level1.expression import Boolean, SendStep
 from level1.frame import BUS_SHIFT, EXTENDED, REMOTE, Frame, frame_key
 from level1.supervisor import Supervisor
@@ -185,6 +186,22 @@ def test_devices_are_told_apart_also_on_two_buses() -> None:
     frames = [heartbeat(t * 500 * MS, bus=bus) for t in range(20) for bus in (0, 1) if bus or t < 10]
     outputs = target.receive_many(frames)
     assert [(event.values["Bus"], event.values["Device"]) for event in raised(outputs)] == [(0, "Air-blast sprayer")]
+
+
+def test_a_device_taken_off_on_purpose_is_forgotten_when_someone_at_the_machine_says_so() -> None:
+    target = unit(SPRAYER, Device(0, 43, "Sensors", 500 * MS, required=True), start_ns=0)
+    target.receive_many([*beats(0, 2 * SECOND), heartbeat(2 * SECOND, node=43)])
+    target.tick(10 * SECOND)
+
+    def reset(t_ns: int, origin: Literal["local", "above"] = "local") -> tuple[str, list[tuple[float, str, str]]]:
+        outputs = target.command(Order("1", "reset", "DeviceSilent", origin=origin), t_ns)
+        return next(output.reason for output in outputs if isinstance(output, Result)), told(outputs)
+    assert reset(11 * SECOND, "above") == ("DeviceSilent can only be reset at the machine", [])
+    assert reset(12 * SECOND) == ("Sensors (node 43) must be there by the configuration", [(12, "DeviceSilent", "cleared")])
+    assert told(target.receive(heartbeat(13 * SECOND, node=43))) == [(13, "DeviceSilent", "cleared")]
+    assert reset(13 * SECOND) == ("no device is silent", [])
+    assert told(target.receive_many([heartbeat(14 * SECOND, BOOT_UP), heartbeat(14 * SECOND, node=43)])) == []
+    assert told(target.tick(30 * SECOND)) == [(15.75, "DeviceSilent", "raised")] * 2
 
 
 # --- emergencies ------------------------------------------------------------------------------------------------------------
