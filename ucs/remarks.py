@@ -20,13 +20,14 @@ def remarks(log: Log | MergedLog, counters: Mapping[str, int], keys: Iterable[in
     if log.skipped:
         yield f"{log.complaints[0]}; {log.skipped:,} {'line' if log.skipped == 1 else 'lines'} skipped in all"
     if log.error_frames or log.remote_frames:
-        yield f"{log.error_frames:,} error frames, {log.remote_frames:,} remote frames"
+        yield f"{_count(log.error_frames, 'error frame')}, {_count(log.remote_frames, 'remote frame')}"
     if backwards := counters.get("time stamps that ran backwards", 0):
         yield f"{backwards:,} time stamps ran backwards and were taken as the highest before them"
     data = {key for key in keys if not key & (ERROR | REMOTE)}
     known = known_ids(catalog, data)
     if data and not known:
-        yield (f"none of the {len(data)} ids in this recording ({_some_ids(data)}) is in these definitions"
+        which = f"none of the {len(data):,} ids" if len(data) > 1 else "the only id"
+        yield (f"{which} in this recording ({_some_ids(data)}) is {'' if len(data) > 1 else 'not '}in these definitions"
                f"{_nearest(catalog, data)}; give the DBC files of the machine that was recorded")
     yield from _other_sources(catalog, data, known)
     for name in sorted(set(asked) - log.channels_seen):
@@ -97,6 +98,10 @@ def _other_sources(catalog: Catalog, keys: set[int], known: set[int]) -> Iterato
     yield from told[:MOST_SOURCES]
     if len(told) > MOST_SOURCES:
         yield f"{len(told) - MOST_SOURCES} more messages come from another source address than their definitions say"
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number:,} {word}{'' if number == 1 else 's'}"
 
 
 def _some_ids(keys: Iterable[int]) -> str:

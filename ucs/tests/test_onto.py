@@ -126,7 +126,7 @@ def test_a_recording_arrives_on_a_bus_whole_and_in_order(replay: Run, log: Path)
         heard = [bus.recv(0) for _ in range(21)]
     assert code == 0 and out.startswith("played 20 frames in ") and "; 1 error frames" in out
     assert [message and message.arbitration_id for message in heard] == [*range(0x100, 0x114), None]
-    assert err == f"ucs: {log}: 1 error frames, 0 remote frames\n"
+    assert err == f"ucs: {log}: 1 error frame, 0 remote frames\n"
 
 
 def test_channels_go_where_they_are_sent(replay: Run, log: Path) -> None:
