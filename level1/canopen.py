@@ -244,7 +244,7 @@ class Devices:
         return f"{device.name} (node {node})" if device is not None and device.name else f"node {node}"
 
     def taken_off(self, t_ns: int) -> str:
-        """Someone at the machine says that the silent devices were taken off on purpose: they are forgotten until they are heard again.
+        """Someone at the machine says that the silent devices were taken off on purpose: they are forgotten until heard again.
 
         Gives the reason of a refusal: there is none, or one of them must be there.
         """
