@@ -96,13 +96,18 @@ class Monitor(msgspec.Struct, frozen=True):
 
 Output = Event | Send | Result | Monitor
 
+_SPELT_OUT = Decimal("1e-6")
+"""Below this a decimal is written as 1E-9."""
 _encoder = msgspec.json.Encoder(decimal_format="number")
 _decoder = msgspec.json.Decoder(Event, strict=False)
 
 
 def encode(event: Event | Monitor | Result) -> bytes:
-    """One JSON object, keys in the order of the fields, no line end."""
-    return _encoder.encode(event)
+    """One JSON object, keys in the order of the fields, no line end; times with nine places, the smallest too."""
+    line = _encoder.encode(event)
+    if not isinstance(event, Result) and abs(event.t) < _SPELT_OUT:
+        line = line.replace(b'"t":%s' % str(event.t).encode(), b'"t":%s' % f"{event.t:f}".encode(), 1)
+    return line
 
 
 def decode(line: bytes | str) -> Event:

@@ -13,8 +13,9 @@ public one goes into a key file that units read: [bridge] keys = "keys.toml". Ta
 at once.
 """
 EPILOG = """\
-Roles, each with the rights of those before it: view (monitor_period), acknowledge, stop, pause (and reduce_speed), reset (and resume and
-every other command). Hazard lock-outs can't be reset from level 2 at all.
+Roles, each with the rights of those before it: view (monitor_period), acknowledge, stop, pause (and
+reduce_speed), reset (and resume and every other command).
+Hazard lock-outs can't be reset from level 2 at all.
 
   ucs keys make chief --role reset --keys keys.toml
   ucs keys list keys.toml

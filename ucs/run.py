@@ -30,6 +30,9 @@ from ucs.printer import Printer
 from ucs.render import clock, event_line, painted, wants_colour
 from ucs.uplink import Uplink
 
+PLAUSIBLE_S = 1_700_000_000
+"""A wall clock before this (November 2023) has never been set."""
+
 
 def add_parser(commands: Any) -> None:
     """The arguments of `ucs run`."""
@@ -60,7 +63,7 @@ def run(args: Namespace) -> int:
         for port in ports:
             port.start()
             stack.callback(port.stop)
-        journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name))
+        journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name, new_boot=_first_boot()))
         uplink = stack.enter_context(Uplink(journal, inbox, time.monotonic_ns))
         sources = readings.start(settings, catalog, ports, journal, inbox, stack)
         histories = HistoryReader(settings.bus, inbox.notice)
@@ -74,6 +77,12 @@ def run(args: Namespace) -> int:
             printer.out(f"boot {journal.boot}, journal {settings.journal.path}; supervising")
             live.run()
     return 0
+
+
+def _first_boot() -> int:
+    """The boot id for a unit that finds no trace of an earlier journal: with an exchanged card it must not begin at 1 again."""
+    now_s = int(time.time())
+    return now_s if now_s > PLAUSIBLE_S else 1
 
 
 def _supervisor(settings: Config, catalog: Catalog, journal: Journal, own: frozenset[str],

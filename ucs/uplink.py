@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from bridge.delivered import delivered_path, delivered_upto
-from bridge.link import RunLink
+from bridge.link import Refusal, RunLink
+from level1.bus_health import Report
 from level1.event import Event, Monitor, Result
 from level1.io.inbox import Inbox
 from level1.io.journal import Journal
@@ -18,6 +19,8 @@ ALIVE_NS = 500_000_000
 BESIDE_NS = 2_000_000_000
 """So often the events that the journal can't take are handed over again: nobody says whether they arrived."""
 
+COMMAND_REFUSED = "CommandRefused"
+"""Alarm of `ucs.dbc` whose causes are commands that the gate has refused."""
 PRUNE_S = 60.0
 """So often the journal learns what level 2 has, and may shrink to its bound."""
 
@@ -67,5 +70,15 @@ class Uplink:
                 return
             for instruct in self._link.receive():
                 self._inbox.order(instruct.order)
+            while self._link.refusals:
+                self._inbox.report(_refused(self._link.refusals.popleft(), self._clock()))
             if not readable:
                 self._journal.prune(delivered_upto(delivered_path(Path(self._journal.path))))
+
+
+def _refused(refusal: Refusal, now_ns: int) -> tuple[Report, Report]:
+    """Raised and cleared at once: a command that was refused is an occasion, not a state."""
+    key = f"{refusal.reason}/{refusal.key}"
+    detail = {"Reason": refusal.reason, "Key": refusal.key, "Count": refusal.count}
+    text = f"{refusal.count} command{'' if refusal.count == 1 else 's'} refused: {refusal.reason}"
+    return (Report(now_ns, COMMAND_REFUSED, key, True, detail, text), Report(now_ns, COMMAND_REFUSED, key, False, detail, text))

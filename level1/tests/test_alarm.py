@@ -151,6 +151,13 @@ def test_the_freeze_frame_names_the_inputs() -> None:
         "unit boot seq t utc utc_trusted alarm code priority event instance attempt values text"
 
 
+def test_times_have_nine_places_from_the_first_nanosecond() -> None:
+    target = supervisor([TANK], [alarm("Low", LOW)])
+    lines = [encode(out) for t, level in ((0, 10), (1, 50), (1500, 10)) for out in target.receive_many([frame(t, TANK, level)])
+             if isinstance(out, Event)]
+    assert [line.split(b'"t":')[1].split(b",")[0] for line in lines] == [b"0.000000000", b"0.000000001", b"0.000001500"]
+
+
 def test_alarm_messages_go_out_at_every_change_and_at_their_cycle() -> None:
     target = supervisor([TANK], [alarm("Low", LOW), alarm("Empty", compare("TANK.Level", "<", 5), 2)], broadcast=True)
     outputs = target.receive_many([frame(0, TANK, 50), frame(2500 * MS, TANK, 10)])
