@@ -210,9 +210,10 @@ def _run_live(args: argparse.Namespace, scenario: Scenario, cast: Cast, on_frame
         raise OutsideError(str(error)) from error
     finally:
         if bus.frames:
+            now_ns = clock.now_ns()
             if unit:
-                unit.end(clock.now_ns(), scenario.title)
-            sys.stdout.write(_summary(cast, clock.now_ns(), bus.frames))
+                unit.end(now_ns, scenario.title)
+            sys.stdout.write(_summary(cast, now_ns, bus.frames))
             sys.stdout.flush()
     return 0
 
