@@ -17,6 +17,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from level1.io.socketcan import enlarge
+
 FRAME = 16
 PORTION = 200
 """Frames that wait in the socket at a time: what fits where the buffer may not be enlarged."""
@@ -30,7 +32,7 @@ def main(contender: str, folder: str, count: str, rate: str) -> None:
         print(json.dumps({"rss_mb": resident_mb("VmHWM"), "alarms": kept}))
         return
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
+    enlarge(sock)
     sock.bind(("127.0.0.1", 0))
     handled: list[tuple[int, int]] = []
     drain = peer(sock, Path(folder), handled) if contender == "peer" else core(sock, Path(folder), handled, contender == "journal")

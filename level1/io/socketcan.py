@@ -147,7 +147,7 @@ class SocketCan:
         self._sock = _raw_socket()
         self._error_sock = _raw_socket()
         try:
-            _enlarge(self._sock)
+            enlarge(self._sock)
             if settings.fd:
                 self._sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
             self._error_sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
@@ -272,7 +272,7 @@ def _raw_socket() -> socket.socket:
     return sock
 
 
-def _enlarge(sock: socket.socket) -> None:
+def enlarge(sock: socket.socket) -> None:
     """As large a buffer as the kernel allows: without the right to (CAP_NET_ADMIN) it is net.core.rmem_max."""
     try:
         sock.setsockopt(socket.SOL_SOCKET, _RCVBUFFORCE, BUFFER_BYTES)
