@@ -28,7 +28,7 @@ from level1.io.error import OutsideError, did_you_mean
 ROLES = ("view", "acknowledge", "stop", "pause", "reset")
 """From least to most; each may do what those before it may."""
 RIGHTS = {"acknowledge": "acknowledge", "stop": "stop", "pause": "pause", "reduce_speed": "pause", "resume": "reset",
-          "reset": "reset", "monitor_period": "view"}
+          "reset": "reset", "monitor_period": "view", "request_dm2": "view"}
 """The role a command needs. A command that is not named here, from the definitions, needs the last one."""
 
 

@@ -10,8 +10,8 @@ import msgspec
 class Order(msgspec.Struct, frozen=True):
     """A command.
 
-    id: names it in its `Result`. name: acknowledge, reset, pause, resume, stop, or one that `Commands` in a DBC names.
-    target: alarm name (acknowledge, reset; "" means all for acknowledge). value: the `$value` of a DBC command, physical.
+    id: names it in its `Result`. name: acknowledge, reset, pause, resume, stop, request_dm2, or one that `Commands` in a DBC names.
+    target: alarm name (acknowledge, reset; "" means all for acknowledge), or source address (request_dm2). value: the `$value` of a DBC command, physical.
     origin: "local" (someone at the machine) or "above" (level 2).
     """
 

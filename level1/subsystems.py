@@ -16,7 +16,7 @@ from level1.condition import Things
 from level1.event import Send
 from level1.frame import BUS_SHIFT, EXTENDED
 from level1.j1939 import DM1, FMI_WORDS, TP_CM, TP_DT, Transport, TroubleCodeReport, parse_dm1
-from level1.j1939_node import ADDRESS_CLAIMED, REQUEST, Node, name_of
+from level1.j1939_node import ADDRESS_CLAIMED, DM2, GLOBAL, NULL, REQUEST, Node, name_of
 from level1.timer import Timers
 
 TROUBLE_CODE = "TroubleCode"
@@ -25,8 +25,9 @@ ADDRESS_CONFLICT = "AddressConflict"
 """Alarm of `ucs.dbc`: another node claims or uses the address of the UCS."""
 SECOND_TALKER = "SecondTalker"
 """Alarm of `ucs.dbc`: someone else sends a message that is the UCS's own."""
-PROTOCOL_LIFE_NS = 100_000_000
-"""A frame of a protocol is worthless after this."""
+PROTOCOL_LIFE_NS = 1_000_000_000
+"""A frame of a protocol is worthless after this: T3 of the transport protocol is 1.25 s, and the first claim of an address must
+outlive the start of the program."""
 
 
 class Host(Protocol):
@@ -37,6 +38,9 @@ class Host(Protocol):
 
     def hand_out(self, send: Send) -> None:
         """Send a frame of a protocol."""
+
+    def tell(self, t_ns: int, message: str, values: dict[str, Any]) -> None:
+        """Send a monitoring message upward."""
 
 
 class Subsystems:
@@ -77,6 +81,26 @@ class Subsystems:
         for node in self._nodes.values():
             node.report(t_ns, codes, lamps)
 
+    def request_stored(self, t_ns: int, source: str) -> str:
+        """Ask a sender for the trouble codes it has stored (DM2); they come as the monitoring message `dm2`. source: its address,
+        "255" for all. Gives the reason of a refusal."""
+        if not self._nodes:
+            return "the UCS has no J1939 address to ask from: set j1939 on a [[bus]]"
+        if not source.isdigit() or not 0 <= int(source) <= GLOBAL or int(source) == NULL:
+            return f'"{source}" is no source address; name one of 0 to 253, or 255 for all'
+        for node in self._nodes.values():
+            node.request(t_ns, DM2, int(source))
+        return ""
+
+    def _stored(self, t_ns: int, key: int, data: bytes) -> None:
+        """A DM2: what a sender has stored."""
+        diagnosis = parse_dm1(data)
+        if diagnosis is None:
+            self.counters["trouble code messages cut short"] += 1
+            return
+        codes = "; ".join(f"SPN {code.spn} FMI {code.fmi} × {code.occurrences}" for code in diagnosis.codes)
+        self.host.tell(t_ns, "dm2", {"SourceAddress": key & 0xFF, "Bus": key >> BUS_SHIFT, "Codes": codes})
+
     def newcomer(self, key: int) -> None:
         """An identifier is heard for the first time: is it one that only the UCS may send?"""
         if key in self.own_keys:
@@ -99,6 +123,7 @@ class Subsystems:
                     answer(node, t_ns, key, data)
             return listener
         self.board.listen(DM1, self._diagnosed)
+        self.board.listen(DM2, self._stored)
         self.board.listen(TP_CM, answered(Node.connection, transport.connection))
         self.board.listen(TP_DT, answered(Node.packet, transport.packet))
         if self._nodes:

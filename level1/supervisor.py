@@ -38,6 +38,8 @@ from level1.repair import RepairMachine
 from level1.subsystems import TROUBLE_CODE, Subsystems
 from level1.timer import FAR, Timed, Timers
 
+REQUEST_STORED = "request_dm2"
+"""Order that asks a J1939 sender (target: its address) for the trouble codes it has stored."""
 UNTOLD = -1
 """Outcome of a condition before its first evaluation: whatever it is then, its alarm is told."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -422,6 +424,11 @@ class Supervisor:
         """A frame of a protocol, which no definition names."""
         self._out.append(send)
 
+    def tell(self, t_ns: int, message: str, values: dict[str, Any]) -> None:
+        """A monitoring message of what a subsystem has been asked for."""
+        self._out.append(Monitor(self.unit, self.boot, seconds(t_ns), self.utc(t_ns), self.utc_trusted, message, values,
+                                 dict.fromkeys(values, 0.0), dict.fromkeys(values, QUALITY_WORDS[GOOD])))
+
     def utc(self, t_ns: int) -> str | None:
         """RFC 3339 label of a time, None where no wall clock is known."""
         if self.utc_offset_ns is None:
@@ -489,6 +496,8 @@ class Supervisor:
         """Carry an order out; gives the reason of a refusal."""
         if order.name in ("acknowledge", "reset"):
             return self._people(order)
+        if order.name == REQUEST_STORED:
+            return self.subsystems.request_stored(self.now_ns, order.target)
         commands = [command for name, command in self.catalog.commands.items() if order.name in (name, name.partition("@")[0])]
         if order.name not in ("pause", "resume", "stop") and not commands:
             return f"unknown command {order.name}"

@@ -2,7 +2,8 @@
 from __future__ import annotations
 
 from level1.catalog import Alarm
-from level1.event import Event, Output, Send
+from level1.command import Order
+from level1.event import Event, Monitor, Output, Result, Send
 from level1.expression import Boolean
 from level1.frame import EXTENDED, Frame
 from level1.j1939 import parse_dm1
@@ -114,6 +115,16 @@ def test_someone_elses_frame_under_an_own_identifier_is_told() -> None:
     target.tick(SECOND)
     outputs = target.receive_many([Frame(SECOND, 0x650, bytes(8)), Frame(SECOND, 0x18FF0080 | EXTENDED, bytes(8))])
     assert [out.alarm for out in outputs if isinstance(out, Event)] == ["SecondTalker", "AddressConflict"]
+
+
+def test_stored_codes_are_asked_for_and_told() -> None:
+    target = supervisor(LOW)
+    target.tick(SECOND)
+    outputs = list(target.command(Order("1", "request_dm2", "0"), SECOND))
+    assert [(send.key & 0x1FFFFFFF, send.data) for send in sent(outputs, 0xEA00)] == [(0x18EA0080, bytes([0xCB, 0xFE, 0]))]
+    answer = target.receive(Frame(SECOND, 0x18FECB00 | EXTENDED, b"\x04\xff" + dtc(100, 4, 3) + b"\xff\xff"))
+    assert [(out.message, out.values["Codes"]) for out in answer if isinstance(out, Monitor)] == [("dm2", "SPN 100 FMI 4 × 3")]
+    assert [out.outcome for out in target.command(Order("2", "request_dm2", "x"), SECOND) if isinstance(out, Result)] == ["refused"]
 
 
 def test_names_order_by_their_fields() -> None:
