@@ -29,6 +29,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=100_000, help="from a full socket (default %(default)s)")
     parser.add_argument("--seconds", type=float, default=10, help="at the rate of a full bus (default %(default)s)")
     parser.add_argument("--rounds", type=int, default=3, help="how often each is timed (default %(default)s)")
+    parser.add_argument("--alone", action="store_true", help="run before all other programs (SCHED_FIFO); disturbs them")
     args = parser.parse_args()
     load = workload.make(max(args.frames, round(FULL_BUS_PER_S * args.seconds)) * SPARE)
     print(machine())
@@ -39,7 +40,7 @@ def main() -> int:
         (folder / "live.dbc").write_text(workload.dbc(load))
         (folder / "rules.pickle").write_bytes(pickle.dumps(load.rules))
         full_socket(folder, args.frames, args.rounds)
-        full_bus(folder, round(FULL_BUS_PER_S * args.seconds), args.rounds)
+        full_bus(folder, round(FULL_BUS_PER_S * args.seconds), args.rounds, args.alone)
         print(f"\nresident, `ucs run` with all shipped definitions: {run(folder, 'shipped')['rss_mb']:.1f} MB")
     return 0
 
@@ -57,23 +58,23 @@ def full_socket(folder: Path, frames: int, rounds: int) -> None:
     print(f"ratio: {each['peer'] / each['core']:.1f}\n")
 
 
-def full_bus(folder: Path, frames: int, rounds: int) -> None:
+def full_bus(folder: Path, frames: int, rounds: int, alone: bool) -> None:
     """Frames that come one by one, as fast as a full bus brings them."""
     print(f"at {FULL_BUS_PER_S:,} frames/s, {frames:,} frames, median of {rounds} rounds in turn")
     contenders = CONTENDERS | JOURNALED
     results: dict[str, list[dict[str, Any]]] = {name: [] for name in contenders}
     for _ in range(rounds):
         for name, found in results.items():
-            found.append(run(folder, name, frames, FULL_BUS_PER_S))
+            found.append(run(folder, name, frames, FULL_BUS_PER_S, alone))
     for name, found in results.items():
         one = {key: median(result[key] for result in found) for key in found[0]}
         print(f"  {contenders[name]:<36}{one['cpu_percent']:>6.1f} % of a core   frame to verdict p50 {one['p50_ms']:.2f}, "
               f"p99 {one['p99_ms']:.2f}, worst {one['worst_ms']:.1f} ms   {one['lost']:.0f} lost   {one['rss_mb']:.1f} MB")
 
 
-def run(folder: Path, contender: str, frames: int = 0, rate: int = 0) -> dict[str, Any]:
+def run(folder: Path, contender: str, frames: int = 0, rate: int = 0, alone: bool = False) -> dict[str, Any]:
     """A contender in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.receiver", contender, str(folder), str(frames), str(rate)]
+    command = [sys.executable, "-m", "benchmarks.receiver", contender, str(folder), str(frames), str(rate), str(int(alone))]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(done.stderr)

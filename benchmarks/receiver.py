@@ -1,7 +1,7 @@
 """One contender over a datagram socket that stands for the CAN socket, in a process of its own: `benchmarks.live` starts it.
 
-CONTENDER FOLDER N RATE: `core`, `journal` (the same with its journal), `peer`, or `shipped` (only loads). RATE 0: the socket is
-full. Prints its figures as JSON.
+CONTENDER FOLDER N RATE ALONE: `core`, `journal` (the same with its journal), `peer`, or `shipped` (only loads). RATE 0: the socket
+is full. ALONE 1: before all other programs. Prints its figures as JSON.
 """
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PORTION = 200
 Drain = Callable[[], int]
 
 
-def main(contender: str, folder: str, count: str, rate: str) -> None:
+def main(contender: str, folder: str, count: str, rate: str, alone: str) -> None:
     """Measure one contender."""
     if contender == "shipped":
         kept = shipped(Path(folder))
@@ -37,21 +37,18 @@ def main(contender: str, folder: str, count: str, rate: str) -> None:
     handled: list[tuple[int, int]] = []
     drain = peer(sock, Path(folder), handled) if contender == "peer" else core(sock, Path(folder), handled, contender == "journal")
     if int(rate):
-        undisturbed(1)
-        print(json.dumps(paced(sock, Path(folder), int(count), int(rate), drain, handled)))
+        settle_on(1, alone == "1")
+        print(json.dumps(paced(sock, Path(folder), int(count), int(rate), drain, handled, alone)))
     else:
         print(json.dumps({"cpu_s": full(sock, Path(folder), int(count), drain)}))
 
 
-def undisturbed(core: int) -> bool:
-    """On a core of its own where there are several, before all other programs where that is allowed; gives whether it is."""
+def settle_on(core: int, alone: bool) -> None:
+    """Run on a core of its own where there are several; alone: before all other programs. Raises PermissionError."""
     if (os.cpu_count() or 1) > 1:
         os.sched_setaffinity(0, {core})
-    try:
+    if alone:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
-    except PermissionError:
-        return False
-    return True
 
 
 def full(sock: socket.socket, folder: Path, count: int, drain: Drain) -> float:
@@ -72,9 +69,11 @@ def full(sock: socket.socket, folder: Path, count: int, drain: Drain) -> float:
     return spent
 
 
-def paced(sock: socket.socket, folder: Path, count: int, rate: int, drain: Drain, handled: list[tuple[int, int]]) -> dict[str, Any]:
+def paced(sock: socket.socket, folder: Path, count: int, rate: int, drain: Drain, handled: list[tuple[int, int]],
+          alone: str) -> dict[str, Any]:
     """CPU share and times from a frame's leaving the sender to its verdict. handled: (frames, ns) of each batch."""
-    command = [sys.executable, "-m", "benchmarks.sender", *map(str, (sock.getsockname()[1], rate, count, folder / "frames.bin"))]
+    command = [sys.executable, "-m", "benchmarks.sender",
+               *map(str, (sock.getsockname()[1], rate, count, folder / "frames.bin", alone))]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as sender:
         done = drain()
         while not done:

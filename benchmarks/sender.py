@@ -1,6 +1,7 @@
 """Sends CAN frames as datagrams, evenly, and tells when each left: `benchmarks.receiver` starts it.
 
-PORT RATE N FRAMES: `FRAMES` holds 16-byte frames. Writes N times of the monotonic clock to its output, ns, as 64-bit integers.
+PORT RATE N FRAMES ALONE: `FRAMES` holds 16-byte frames. Writes N times of the monotonic clock to its output, ns, as 64-bit
+integers.
 """
 from __future__ import annotations
 
@@ -10,12 +11,12 @@ import time
 from array import array
 from pathlib import Path
 
-from benchmarks.receiver import FRAME, undisturbed
+from benchmarks.receiver import FRAME, settle_on
 
 
-def main(port: str, rate: str, count: str, path: str) -> None:
+def main(port: str, rate: str, count: str, path: str, alone: str) -> None:
     """Send, looking at the clock all the time: a sleep would wake up late."""
-    undisturbed(0)
+    settle_on(0, alone == "1")
     data = Path(path).read_bytes()
     period_ns = 1_000_000_000 / int(rate)
     sent = array("q", bytes(8 * int(count)))
