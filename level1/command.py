@@ -10,9 +10,9 @@ import msgspec
 class Order(msgspec.Struct, frozen=True):
     """A command.
 
-    id: names it in its `Result`. name: acknowledge, reset, pause, resume, stop, request_dm2, or one that `Commands` in a DBC names.
-    target: alarm name (acknowledge, reset; "" means all for acknowledge), or source address (request_dm2). value: the `$value` of a DBC command, physical.
-    origin: "local" (someone at the machine) or "above" (level 2).
+    id: names it in its `Result`. name: acknowledge, reset, pause, resume, stop, request_dm2, or one that `Commands` in a
+    DBC names. target: alarm name (acknowledge, reset; "" means all for acknowledge), or source address (request_dm2).
+    value: the `$value` of a DBC command, physical. origin: "local" (someone at the machine) or "above" (level 2).
     """
 
     id: str

@@ -36,6 +36,9 @@ class Host(Protocol):
     def report(self, t_ns: int, alarm: str, key: str, present: bool, detail: dict[str, Any], text: str) -> None:
         """One cause of an alarm is there, or no more."""
 
+    def causes(self, alarm: str) -> dict[str, dict[str, Any]]:
+        """The causes of an alarm that are there, also those of an earlier boot, by key."""
+
     def hand_out(self, send: Send) -> None:
         """Send a frame of a protocol."""
 
@@ -149,9 +152,9 @@ class Subsystems:
             return
         source, bus = key & 0xFF, key >> BUS_SHIFT
         sender = bus << 8 | source
-        before = self._codes.get(sender, {})
         now = {f"{bus}/{source}/{code.spn}/{code.fmi}": code for code in diagnosis.codes}
-        for name in before.keys() - now.keys():
+        known = (name for name in self.host.causes(TROUBLE_CODE) if name.startswith(f"{bus}/{source}/"))
+        for name in sorted(set(known) - now.keys()):
             self.host.report(t_ns, TROUBLE_CODE, name, False, {}, "")
         for name, code in now.items():
             detail = {"SourceAddress": source, "SPN": code.spn, "FMI": code.fmi, "Occurrences": code.occurrences,

@@ -99,6 +99,14 @@ def test_a_reported_cause_survives_a_restart_and_clears_then() -> None:
     assert told(again, [dm1(1, 0, bytes(4))]) == [("cleared", 100, 4)]
 
 
+def test_a_cause_that_vanished_while_the_unit_was_off_clears_at_the_first_report() -> None:
+    target = supervisor([], [REPORTED])
+    told(target, [dm1(0, 0, dtc(100, 4)), dm1(0, 3, dtc(7, 7))])
+    again = supervisor([], [REPORTED], boot=2, restored=target.state())
+    assert told(again, [dm1(0, 0, bytes(4))]) == [("cleared", 100, 4)]
+    assert again.alarm_states() == {"TroubleCode": 1}
+
+
 def test_causes_are_acknowledged_together() -> None:
     target = supervisor([], [alarm("TroubleCode", Boolean(False), 1020, latch=True)])
     told(target, [dm1(0, 0, dtc(100, 4)), dm1(1, 3, dtc(7, 7)), dm1(2, 0, bytes(4)), dm1(3, 3, bytes(4))])
