@@ -2,9 +2,10 @@
 
 Theory of operation. The other tests run here, natively. Then the same pytest command runs once more under
 `hil_tests/vcan_run.py`, restricted to the `vcan` tests selected here; it hands each report over as it comes and they are
-taken in as if the tests had run here: one summary, one exit status, and `-x`, `-k`, `--lf`, `--junitxml` do what they always
-do. A `vcan` test for which no report came (the guest died, ran out of time, could not collect it) is an error. Without a way
-to a vcan the run ends at once with exit status 125 and the packages to install; nothing is skipped.
+taken in as if the tests had run here (in two guests beside each other, as these tests mostly wait): one summary, one exit
+status, and `-x`, `-k`, `--lf`, `--junitxml` do what they always do. A `vcan` test for which no report came (the guest died,
+ran out of time, could not collect it) is an error. Without a way to a vcan the run ends at once with exit status 125 and
+the packages to install; nothing is skipped.
 """
 from __future__ import annotations
 
@@ -14,6 +15,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,8 @@ SELECTED = "VCAN_RUN_SELECTED"
 MARK = "\x1e"
 """Starts and ends a line of the guest's output that is one message as JSON."""
 TIMEOUT_S = 840
+GUESTS = 2
+"""Guests at one time: their tests wait for purges and time-outs rather than compute."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -54,7 +58,7 @@ def pytest_runtestloop(session: pytest.Session) -> Generator[None, object, objec
     session.items[:] = [item for item in everything if not needs_vcan(item)]
     try:
         result = yield
-        Guest(session, elsewhere).run()
+        run_guests(session, elsewhere)
     finally:
         session.items[:] = everything
     return result
@@ -74,44 +78,71 @@ def needs_vcan(item: pytest.Item) -> bool:
     return item.get_closest_marker("vcan") is not None
 
 
+def run_guests(session: pytest.Session, items: list[pytest.Item]) -> None:
+    """Run the `vcan` tests in `GUESTS` guests, each the tests of some files; what they report is taken in guest by guest."""
+    files = list(dict.fromkeys(item.path for item in items))
+    shares = [[item for item in items if files.index(item.path) % GUESTS == number] for number in range(GUESTS)]
+    with contextlib.ExitStack() as stack:
+        for guest in [stack.enter_context(Guest(session, share)) for share in shares if share]:
+            guest.run()
+
+
 class Guest:
-    """The run of the `vcan` tests under `vcan_run`, as seen from outside."""
+    """A run of `vcan` tests under `vcan_run`, as seen from outside; a context manager."""
 
     def __init__(self, session: pytest.Session, items: list[pytest.Item]):
         self.session, self.config, self.items = session, session.config, items
         self.waiting = {item.nodeid: item for item in items}
         self.output: list[str] = []
+        self.job = tempfile.TemporaryDirectory(prefix="vcan-tests-")
+        self.runner = self._start(Path(self.job.name))
+
+    def __enter__(self) -> Guest:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.runner.terminate()
+        self.runner.wait()
+        self.job.cleanup()
 
     def run(self) -> None:
-        """Run them; their reports are taken in as they come. Raises what ends a session early (`-x`, Ctrl-C)."""
-        with tempfile.TemporaryDirectory(prefix="vcan-tests-") as job, self._start(Path(job)) as lines:
-            for line in lines:
-                if line.startswith(MARK):
-                    self._take(json.loads(line.strip(MARK + "\r\n")))
-                else:
-                    self._keep(line)
+        """Take their reports in as they come. Raises what ends a session early (`-x`, Ctrl-C)."""
+        for line in self._lines():
+            if line.startswith(MARK):
+                self._take(json.loads(line.strip(MARK + "\r\n")))
+            else:
+                self._keep(line)
         if not self.session.shouldfail and not self.session.shouldstop:
             self._blame()
         self._stop_if_asked()
 
-    @contextlib.contextmanager
-    def _start(self, job: Path) -> Iterator[Iterator[str]]:
-        """The lines that the guest's pytest writes; at the end its exit status is kept in `self.status`."""
+    def _start(self, job: Path) -> subprocess.Popen[bytes]:
+        """The guest; what its pytest writes goes into the file `out`, so that it never waits for a reader."""
         selected = job / "selected"
         selected.write_text("\n".join(self.waiting))
         parameters = self.config.invocation_params
         command = [sys.executable, vcan_run.__file__, "-t", str(TIMEOUT_S), sys.executable, "-m", "pytest",
                    *map(str, parameters.args), "-o", f"cache_dir={job / 'cache'}"]
-        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                              cwd=parameters.dir, env={**os.environ, SELECTED: str(selected)}, text=True,
-                              errors="backslashreplace", bufsize=1) as runner:
-            assert runner.stdout is not None
-            try:
-                yield iter(runner.stdout)
-            except BaseException:
-                runner.terminate()
-                raise
-        self.status = runner.returncode
+        with (job / "out").open("wb") as out:
+            return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT,
+                                    cwd=parameters.dir, env={**os.environ, SELECTED: str(selected)})
+
+    def _lines(self) -> Iterator[str]:
+        """The lines that the guest's pytest writes, until it ends."""
+        with (Path(self.job.name) / "out").open(encoding="utf-8", errors="backslashreplace") as out:
+            line = ""
+            while True:
+                ended = self.runner.poll() is not None
+                line += out.readline()
+                if line.endswith("\n"):
+                    yield line
+                    line = ""
+                elif ended:
+                    if line:
+                        yield line
+                    return
+                else:
+                    time.sleep(0.05)
 
     def _take(self, message: dict[str, Any]) -> None:
         """One message of the guest: a test started, a report, a test finished."""
@@ -139,7 +170,8 @@ class Guest:
 
     def _blame(self) -> None:
         """Every test that did not finish is an error, with what the guest said last."""
-        reason = {vcan_run.TIMED_OUT: f"ran out of time ({TIMEOUT_S} s)"}.get(self.status, f"ended, status {self.status}")
+        status = self.runner.returncode
+        reason = {vcan_run.TIMED_OUT: f"ran out of time ({TIMEOUT_S} s)"}.get(status, f"ended, status {status}")
         text = f"the guest {reason} before this test had finished; its last words:\n{''.join(self.output[-200:])}"
         hook = self.config.hook
         for item in self.waiting.values():
