@@ -25,7 +25,8 @@ FEW_CUTS = 6
 _BAD = np.array(BAD, np.uint8)
 _FLOATS = {16: "<f2", 32: "<f4", 64: "<f8"}
 
-Classes16 = npt.NDArray[np.uint16]
+Numbers = npt.NDArray[Any]
+"""Numbers of classes: bytes where they fit."""
 
 
 class Column:
@@ -58,13 +59,12 @@ class Column:
             self.bads = np.array([cell.bad], np.uint8)
             self.values = np.array([cell.value])
 
-    def at(self, slots: Ints) -> None:
-        """Set what conditions read to what it was at these slots; slots below 0 stand for what it was before."""
-        chosen = self.slots.searchsorted(slots, "right")
-        self.k = self.ks[chosen]
+    def at(self, counts: Ints) -> None:
+        """Set what conditions read to what it was after so many of its changes."""
+        self.k = self.ks[counts]
         if self.numeric:
-            self.bad = self.bads[chosen]
-            self.value = self.values[chosen]
+            self.bad = self.bads[counts]
+            self.value = self.values[counts]
 
 
 _NO_SLOTS: Ints = np.zeros(0, np.int64)
@@ -142,20 +142,20 @@ class SignalColumn(Column):
         if len(losses):
             ks = np.insert(ks, at, old)
             raws = np.insert(raws, at, 0)
-        self.ks = np.concatenate((np.array([cell.k], np.uint16), ks))
+        self.ks = np.concatenate((np.array([cell.k], ks.dtype), ks))
         if self.numeric:
             self._fill(raws, ks)
         return keep, at
 
-    def _classes(self, raws: Words) -> Classes16:
+    def _classes(self, raws: Words) -> Numbers:
         if self._float:
             return self._float_classes(raws)
         cuts = self._cuts
         if len(cuts) > FEW_CUTS:
-            return np.searchsorted(cuts, raws, "right").astype(np.uint16)
-        ks = np.zeros(len(raws), np.uint16)
+            return cuts.searchsorted(raws, "right").astype(np.uint8 if len(cuts) < 240 else np.uint16)
+        ks = np.zeros(len(raws), np.uint8)
         for cut in cuts:
-            ks += raws >= cut
+            ks += (raws >= cut).view(np.uint8)
         return ks
 
     def _floats(self, raws: Words) -> npt.NDArray[np.float64]:
@@ -163,15 +163,15 @@ class SignalColumn(Column):
         with np.errstate(invalid="ignore"):
             return raws.astype(f"<u{size}").view(self._float).astype(np.float64)
 
-    def _float_classes(self, raws: Words) -> Classes16:
+    def _float_classes(self, raws: Words) -> Numbers:
         values = self._floats(raws)
         signal = self.cell.signal
         with np.errstate(invalid="ignore", over="ignore"):
             physical = values * float(signal.factor) + float(signal.offset)
             good = np.isfinite(values) & ~(physical < self._limits[0]) & ~(physical > self._limits[1])
-        return np.where(good, 0, 1).astype(np.uint16)
+        return (~good).view(np.uint8)
 
-    def _fill(self, raws: Words, ks: Classes16) -> None:
+    def _fill(self, raws: Words, ks: Numbers) -> None:
         """Values and badness of the changes."""
         cell, scale = self.cell, self.cell.scale
         without = ks >= cell.base

@@ -52,31 +52,59 @@ class Deal(NamedTuple):
     longest: list[int]
 
 
-def deal(block: Block, t_ns: Ints, numbers: list[int], trees: int) -> Deal:
-    """Sort the rows of a block by tree, in order of time within each. numbers: tree of each talker, negative for none."""
-    lot = np.array([number if number >= 0 else trees for number in numbers])
-    lots: npt.NDArray[Any] = lot.astype(np.uint8 if trees < 256 else np.uint16)[block.talker]
-    counts = np.bincount(lots, minlength=trees + 1)
-    if counts[trees] * 2 > len(block):
-        some = np.flatnonzero(lots < trees)
-        rows = some[np.argsort(lots[some], kind="stable")]
-    else:
-        rows = np.argsort(lots, kind="stable")[:len(block) - counts[trees]]
-    bounds = np.concatenate(([0], np.cumsum(counts[:trees])))
-    starts = bounds[:-1][counts[:trees] > 0]
-    times, lengths, heads = t_ns[rows], block.length[rows], block.head[rows]
-    changed = np.empty(len(rows), bool)
-    np.not_equal(heads[1:], heads[:-1], out=changed[1:])
-    if len(rows) and lengths.min() != lengths.max():
-        changed[1:] |= lengths[1:] != lengths[:-1]
-    changed[starts] = True
-    gaps = np.zeros(len(rows), np.int64)
-    np.subtract(times[1:], times[:-1], out=gaps[:-1])
-    gaps[starts - 1] = 0
-    longest = np.zeros(trees, np.int64)
-    if len(starts):
-        longest[counts[:trees] > 0] = np.maximum.reduceat(gaps, starts)
-    return Deal(rows, times, lengths, changed, bounds.tolist(), longest.tolist())
+class Table:
+    """Where blocks are dealt out. It is used again for each block: fresh memory of this size costs more than what is done with
+    it."""
+
+    def __init__(self) -> None:
+        self._size = 0
+
+    def _make_room(self, rows: int) -> None:
+        if rows > self._size:
+            self._size = rows
+            self._t_ns = np.empty(rows, np.int64)
+            self._gaps = np.empty(rows, np.int64)
+            self._heads = np.empty(rows, np.uint64)
+            self._changed = np.empty(rows, bool)
+
+    def deal(self, block: Block, t_ns: Ints, numbers: list[int], trees: int) -> Deal:
+        """Sort the rows of a block by tree, in order of time within each; the result holds until the next block is dealt.
+
+        numbers: tree of each talker, negative for none.
+        """
+        lot = np.array([number if number >= 0 else trees for number in numbers])
+        lots: npt.NDArray[Any] = lot.astype(np.uint8 if trees < 256 else np.uint16).take(block.talker)
+        counts = np.bincount(lots, minlength=trees + 1)
+        if counts[trees] * 2 > len(block):
+            some = np.flatnonzero(lots < trees)
+            rows = some[np.argsort(lots[some], kind="stable")]
+        else:
+            rows = np.argsort(lots, kind="stable")[:len(block) - counts[trees]]
+        bounds = np.concatenate(([0], np.cumsum(counts[:trees])))
+        starts = bounds[:-1][counts[:trees] > 0]
+        self._make_room(len(rows))
+        times, heads, changed = self._t_ns[:len(rows)], self._heads[:len(rows)], self._changed[:len(rows)]
+        t_ns.take(rows, out=times, mode="clip")
+        block.head.take(rows, out=heads, mode="clip")
+        np.not_equal(heads[1:], heads[:-1], out=changed[1:])
+        shortest = block.length.min()
+        if shortest == block.length.max():
+            lengths = np.broadcast_to(shortest, len(rows))
+        else:
+            lengths = block.length.take(rows)
+            changed[1:] |= lengths[1:] != lengths[:-1]
+        changed[starts] = True
+        return Deal(rows, times, lengths, changed, bounds.tolist(), self._longest(times, starts, counts[:trees]))
+
+    def _longest(self, times: Ints, starts: Ints, counts: Ints) -> list[int]:
+        """The longest gap of each tree."""
+        longest = np.zeros(len(counts), np.int64)
+        if len(starts):
+            gaps = self._gaps[:len(times)]
+            np.subtract(times[1:], times[:-1], out=gaps[:-1])
+            gaps[starts - 1] = 0
+            longest[counts > 0] = np.maximum.reduceat(gaps, starts)
+        return longest.tolist()
 
 
 class Silence(NamedTuple):
@@ -146,6 +174,14 @@ class PagePassage:
             yield Silence(due, page.order, self, place, number + 1)
 
 
+class Flips(NamedTuple):
+    """Frames at which the outcome of a condition changes, and to what."""
+
+    watch: Watch
+    rows: Ints
+    outcomes: npt.NDArray[Any]
+
+
 class Answer:
     """What an answered condition evaluates to in the course of a block: `outcomes`, each from its slot on."""
 
@@ -167,7 +203,7 @@ class Answer:
 class Passage:
     """Drives a supervisor through one block. t_ns: its time stamps, none running backwards; numbers: tree of each talker."""
 
-    def __init__(self, supervisor: Supervisor, plan: Plan, block: Block, t_ns: Ints, numbers: list[int]):
+    def __init__(self, supervisor: Supervisor, plan: Plan, table: Table, block: Block, t_ns: Ints, numbers: list[int]):
         self.board: Board = supervisor.board
         self._meet = supervisor.meet
         self._timers = supervisor.timers
@@ -186,7 +222,7 @@ class Passage:
         strangers = [place for place, key in enumerate(block.keys) if key not in self.board.table]
         if strangers:
             self._fed.append(first_rows(block)[strangers])
-        silences = self._follow_times(numbers)
+        silences = self._follow_times(table, numbers)
         self._deadlines = [(silence.due_ns, silence.order) for silence in silences]
         self._before = t_ns.searchsorted(np.array([silence.due_ns for silence in silences], np.int64), "left")
         self._deadline_slots = self._before + np.arange(len(silences))
@@ -197,10 +233,10 @@ class Passage:
 
     # --- on columns -------------------------------------------------------------------------------------------------------
 
-    def _follow_times(self, numbers: list[int]) -> list[Silence]:
+    def _follow_times(self, table: Table, numbers: list[int]) -> list[Silence]:
         """Give each page its rows, and find all silences, in the order of their deadlines."""
         plan, end_ns = self._plan, int(self._t_ns[-1])
-        dealt = deal(self._block, self._t_ns, numbers, max(plan.roots, default=-1) + 1)
+        dealt = table.deal(self._block, self._t_ns, numbers, max(plan.roots, default=-1) + 1)
         silences: list[Silence] = []
         for number, root in plan.roots.items():
             part = slice(dealt.bounds[number], dealt.bounds[number + 1])
@@ -277,16 +313,16 @@ class Passage:
             if len(column.slots):
                 self._moved.add(column)
 
-    def _rows(self, slots: Ints) -> Ints:
-        """The rows of those slots that are frames."""
+    def _flips_of(self, watch: Watch, slots: Ints, outcomes: npt.NDArray[Any]) -> Flips:
+        """Those of the changes of an outcome that frames make. (Those that silences make are noticed when they fall due.)"""
         if not self._deadlines:
-            return slots
+            return Flips(watch, slots, outcomes)
         before = self._deadline_slots.searchsorted(slots, "left")
-        rows: Ints = (slots - before)[before == self._deadline_slots.searchsorted(slots, "right")]
-        return rows
+        by_frames = before == self._deadline_slots.searchsorted(slots, "right")
+        return Flips(watch, (slots - before)[by_frames], outcomes[by_frames])
 
-    def _evaluate(self) -> tuple[dict[Watch, Answer], list[tuple[Ints, Watch]]]:
-        """The answers of all conditions, and the rows at which they change."""
+    def _evaluate(self) -> tuple[dict[Watch, Answer], list[Flips]]:
+        """The answers of all conditions, and the frames at which they change."""
         answers, flips = {}, []
         for watch, condition in self._plan.answered:
             moved = [column for column in condition.columns if column in self._moved]
@@ -296,7 +332,7 @@ class Passage:
                 changes = np.flatnonzero(zones[1:] != zones[:-1])
                 slots, outcomes = slots[changes], zones[1:][changes]
                 if len(slots):
-                    flips.append((self._rows(slots), watch))
+                    flips.append(self._flips_of(watch, slots, outcomes))
             answers[watch] = Answer(self, watch.outcome, slots.tolist(), outcomes.tolist())
         return answers, flips
 
@@ -304,13 +340,14 @@ class Passage:
         """The slots at which an input of a condition changes, and the zones: before the block, and from each of them on."""
         if condition.table is not None:
             return moved[0].slots, condition.table[moved[0].ks]
-        slots = _union([column.slots for column in moved])
-        with_before = np.concatenate(([-1], slots))
+        slots, places = _merge([column.slots for column in moved])
         for column in condition.columns:
             if column not in self._moved:
                 column.rest()
-            column.at(with_before)
-        return slots, np.broadcast_to(condition.zone(), with_before.shape)
+                column.at(np.zeros(len(slots) + 1, np.int64))
+        for column, place in zip(moved, places, strict=True):
+            column.at(place)
+        return slots, np.broadcast_to(condition.zone(), (len(slots) + 1,))
 
     # --- in time ----------------------------------------------------------------------------------------------------------
 
@@ -328,6 +365,7 @@ class Passage:
                 watch.evaluate = evaluate
             self._hand_back(watchdogs)
             self.board.refresh = refresh
+            self._answers.clear()  # they hold this passage, and with it the block
 
     @property
     def slot(self) -> int:
@@ -393,17 +431,23 @@ class Passage:
 
     def _drive(self) -> None:
         """Through everything that can matter, in order."""
-        board, timers, queued, bells = self.board, self._timers, self.board.queued, [_bell(watch) for _, watch in self._flips]
+        board, timers, queued = self.board, self._timers, self.board.queued
+        watches = [flips.watch for flips in self._flips]
         fed = np.unique(np.concatenate([_NONE, *self._fed]))
         self._count_short(fed)
         frames = zip(self._block.talker[fed].tolist(), self._block.payloads(fed), strict=True)
-        rows = np.concatenate([fed, *(flipped for flipped, _ in self._flips)])
-        tags = np.repeat(np.arange(-1, len(self._flips)), [len(fed), *(len(flipped) for flipped, _ in self._flips)])
+        rows = np.concatenate([fed, *(flips.rows for flips in self._flips)])
+        tags = np.repeat(np.arange(-1, len(self._flips)), [len(fed), *(len(flips.rows) for flips in self._flips)])
+        outcomes = np.concatenate([np.zeros(len(fed), np.uint8), *(flips.outcomes for flips in self._flips)])
         order = np.argsort(rows, kind="stable")
         rows = rows[order]
-        steps = zip(rows.tolist(), self._t_ns[rows].tolist(), self._slots(rows).tolist(), tags[order].tolist(), strict=True)
+        shared = np.zeros(len(rows) + 1, bool)
+        np.equal(rows[1:], rows[:-1], out=shared[1:-1])
+        alone = ~(shared[1:] | shared[:-1])
+        steps = zip(rows.tolist(), self._t_ns[rows].tolist(), self._slots(rows).tolist(), tags[order].tolist(),
+                    outcomes[order].tolist(), alone.tolist(), strict=True)
         now_ns, last = 0, -1
-        for row, t_ns, slot, tag in steps:
+        for row, t_ns, slot, tag, outcome, is_alone in steps:
             if row != last:
                 if queued:
                     board.settle(now_ns)
@@ -413,8 +457,12 @@ class Passage:
             if tag < 0:
                 talker, data = next(frames)
                 self._feed(t_ns, self._block.keys[talker], data)
+            elif is_alone:  # what `settle` would do
+                watch = watches[tag]
+                watch.outcome = outcome
+                watch.sink(t_ns, outcome)
             else:
-                queued.append(bells[tag])
+                queued.append(_bell(watches[tag]))
         if queued:
             board.settle(now_ns)
         if last < len(self._block) - 1:
@@ -483,11 +531,14 @@ def first_rows(block: Block) -> Ints:
     return rows
 
 
-def _union(slots: list[Ints]) -> Ints:
-    """All slots, rising, each once."""
-    if len(slots) == 1:
-        return slots[0]
-    joined = np.sort(np.concatenate(slots), kind="stable")
-    different = np.ones(len(joined), bool)
-    np.not_equal(joined[1:], joined[:-1], out=different[1:])
-    return joined[different]
+def _merge(parts: list[Ints]) -> tuple[Ints, list[Ints]]:
+    """All slots, rising, each once; and for each part how many of its own had come: before all of them, and at each."""
+    joined = np.concatenate(parts)
+    order = np.argsort(joined, kind="stable")
+    joined = joined[order]
+    last = np.ones(len(joined), bool)
+    np.not_equal(joined[1:], joined[:-1], out=last[:-1])
+    ends = np.flatnonzero(last)
+    origin = np.repeat(np.arange(len(parts), dtype=np.uint8), [len(part) for part in parts])[order]
+    counts = [np.concatenate(([0], np.cumsum(origin == number)[ends])) for number in range(len(parts))]
+    return joined[ends], counts

@@ -35,7 +35,7 @@ from level1.event import Output
 from level1.expression import AlarmState, Count, ExpectStep
 from level1.frame import BUS_SHIFT, EXTENDED, frame_key, j1939_pgn
 from level1.j1939 import TP_CM
-from level1.passage import FED, NOBODY, Passage, clamped
+from level1.passage import FED, NOBODY, Passage, Table, clamped
 from level1.supervisor import Supervisor
 
 LEAST_ROWS = 64
@@ -122,6 +122,7 @@ class Sieve:
         self._kinds: dict[int, int | Group] = {}
         self._conditions = self._compile()
         self._is_cyclic = feeds_itself(self.board.catalog)
+        self._table = Table()
         self._plans: dict[frozenset[int], Plan] = {}
 
     # --- building ---------------------------------------------------------------------------------------------------------
@@ -189,7 +190,7 @@ class Sieve:
             self.supervisor.counters["time stamps that ran backwards"] += backwards
         numbers, loose = self._assign(block, t_ns)
         plan = self._plan(loose)
-        Passage(self.supervisor, plan, block, t_ns, numbers).run()
+        Passage(self.supervisor, plan, self._table, block, t_ns, numbers).run()
         return self.supervisor.take(int(t_ns[-1]))
 
     def _assign(self, block: Block, t_ns: Ints) -> tuple[list[int], frozenset[int]]:

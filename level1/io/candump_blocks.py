@@ -6,6 +6,9 @@ places left open. It is learned from one line that the scalar reader understands
 all other characters, and has digits where digits belong, is then read by a few operations on columns. A line that fits no
 shape teaches a new one (the seconds have moved on, another channel, another length), or is left to the scalar reader, which
 also says what is wrong with it.
+
+By far most lines are of the log form, `(stamp) channel ID#DATA` with up to eight data bytes. They need no shape of each
+length: where the shape of their *head* fits, up to the identifier, the rest is read in one go.
 """
 from __future__ import annotations
 
@@ -20,7 +23,6 @@ import numpy.typing as npt
 from level1.block import HEAD_BYTES, Block, Ints, Words
 from level1.frame import BUS_SHIFT, REMOTE
 from level1.io.candump import BYTES, DATE, LATEST_NS, LOG, SCREEN, STAMP, candump_line, spelled_id
-from level1.io.message import FD_BYTES
 
 LONGEST = 256
 """Longer lines are left to the scalar reader; a CAN FD frame of 64 bytes takes 250 characters on the screen at most."""
@@ -28,6 +30,8 @@ FEW_LINES = 6
 """So few lines of a shape are read faster one by one."""
 MAX_SHAPES = 24
 """Shapes remembered for each length of a line."""
+SHORT_LINE = 24
+"""Characters of a short line; where lines are shorter still, a block gets more room when it needs it."""
 MOST_TALKERS = 32_768
 """A block ends before it has many more talkers than that: of random identifiers, a chunk brings a new one each line."""
 CHUNK_BYTES = 1 << 18
@@ -36,7 +40,9 @@ CHUNK_BYTES = 1 << 18
 HEXADECIMAL = re.compile(rb"[0-9A-Fa-f]+")
 _HASH = np.uint64(0x9E37_79B9_7F4A_7C15)
 _SLOTS = 1 << 16
-_NEWLINE = 10
+_NEWLINE, _MARK = b"\n#"
+NAME_SIZE = 9
+"""Characters of the longest identifier and the mark behind it."""
 _NO_ROWS: Ints = np.zeros(0, np.int64)
 
 
@@ -72,12 +78,13 @@ class Shape:
     besides its spelling. data: offset of the payload's first digit, distance of one byte's digits to the next, and bytes.
     """
 
-    __slots__ = ("_columns", "base_ns", "channel", "data", "digits", "flags", "name")
+    __slots__ = ("_columns", "base_ns", "channel", "data", "digits", "flags", "name", "size")
 
     def __init__(self, line: bytes, base_ns: int, digits: tuple[Digits, ...], channel: bytes, name: tuple[int, int], flags: int,
                  data: tuple[int, int, int], others: tuple[tuple[int, int], ...]):
         self.base_ns, self.digits, self.channel, self.name, self.flags, self.data = base_ns, digits, channel, name, flags, data
-        width = width_of(len(line))
+        self.size = len(line)
+        width = width_of(self.size)
         fixed = bytearray(b"\xff" * len(line)).ljust(width, b"\0")
         first, step, count = data
         opened = [*((field.offset, field.offset + field.size) for field in digits), (name[0], sum(name)), *others]
@@ -203,6 +210,19 @@ def learn(line: bytes) -> Shape | None:
                  (first + start, step, count), tuple((begin + start, end + start) for begin, end in others))
 
 
+def learn_head(line: bytes) -> Shape | None:
+    """The shape of what stands before the identifier of a line of the log form; None where there is none."""
+    text = line.lstrip()
+    match = LOG.fullmatch(text.rstrip())
+    shape = learn(line) if match else None
+    if match is None or shape is None:
+        return None
+    head = line[:len(line) - len(text) + match.start(4)]
+    if len(head) + NAME_SIZE + 2 * HEAD_BYTES > LONGEST:
+        return None
+    return Shape(head, shape.base_ns, shape.digits, shape.channel, (0, 0), 0, (0, 2, 0), ())
+
+
 def _stamp_places(text: bytes, begin: int, end: int) -> tuple[Digits, ...] | None:
     """Where the digits of a time stamp stand that change from line to line: two of the seconds, and the fraction."""
     if not (STAMP.fullmatch(text, begin, end) or DATE.fullmatch(text, begin, end)):
@@ -277,15 +297,53 @@ class Names:
             return -1
 
 
-class Piece(NamedTuple):
-    """Frames of one chunk of text. wide_rows, wide: as in `Block`, with the longest payload a frame can have."""
+class Rows:
+    """The rows of a block that is being filled; the same memory for every block, because fresh memory is slow. count: so far."""
 
-    t_ns: Ints
-    talker: npt.NDArray[np.uint16]
-    length: npt.NDArray[np.uint16]
-    head: Words
-    wide_rows: Ints
-    wide: npt.NDArray[np.uint8]
+    def __init__(self, rows: int):
+        self.count = 0
+        self._t_ns = np.empty(rows, np.int64)
+        self._talker = np.empty(rows, np.uint16)
+        self._length = np.empty(rows, np.uint16)
+        self._head = np.empty(rows, np.uint64)
+        self._wide: list[tuple[Ints, npt.NDArray[np.uint8]]] = []
+
+    def sheet(self, lines: int) -> tuple[Ints, npt.NDArray[np.uint16], npt.NDArray[np.uint16], Words]:
+        """Room for the frames of so many lines: times, talkers, lengths, heads."""
+        part = slice(self.count, self.count + lines)
+        if part.stop > len(self._t_ns):
+            for name in ("_t_ns", "_talker", "_length", "_head"):
+                column = getattr(self, name)
+                setattr(self, name, np.concatenate((column[:self.count], np.empty(lines, column.dtype))))
+        return self._t_ns[part], self._talker[part], self._length[part], self._head[part]
+
+    def keep(self, found: npt.NDArray[np.bool_], wide: list[tuple[Ints, npt.NDArray[np.uint8]]]) -> None:
+        """Those lines of the last sheet are frames. wide: lines of frames that are longer than a head, and their payloads."""
+        lines, begin, places = len(found), self.count, np.arange(len(found))
+        self.count += lines
+        if not found.all():
+            kept = int(np.count_nonzero(found))
+            for column in (self._t_ns, self._talker, self._length, self._head):
+                column[begin:begin + kept] = column[begin:begin + lines][found]
+            self.count = begin + kept
+            places = np.cumsum(found) - 1
+        self._wide += [(places[rows] + begin, payloads) for rows, payloads in wide]
+
+    def block(self, keys: list[int]) -> Block:
+        """All rows; they are good until the next sheet is taken."""
+        count, self.count = self.count, 0
+        wide_rows = np.concatenate([_NO_ROWS, *(rows for rows, _ in self._wide)])
+        longest = max((payloads.shape[1] for _, payloads in self._wide), default=0)
+        wide = np.zeros((len(wide_rows), longest + HEAD_BYTES), np.uint8)
+        place = 0
+        for rows, payloads in self._wide:
+            wide[place:place + len(rows), :payloads.shape[1]] = payloads
+            place += len(rows)
+        order = np.argsort(wide_rows)
+        self._wide = []
+        block = Block(self._t_ns[:count], self._talker[:count], keys, self._length[:count], self._head[:count], wide_rows[order],
+                      wide[order])
+        return block
 
 
 class CandumpBlocks:
@@ -299,49 +357,43 @@ class CandumpBlocks:
         self._file = file
         self._bus = bus
         self._skip = skip
+        self._heads: list[Shape] = []
         self._shapes: dict[int, list[Shape]] = {}
         self._buses: dict[bytes, int] = {}
         self._lines = 0
+        self._rows = Rows(0)
         self._forget()
 
     def _forget(self) -> None:
         """Begin a block: no talker is known."""
         self._talkers: dict[tuple[bytes, int], int] = {}
         self._names: dict[tuple[bytes, int], Names] = {}
-        self._pieces: list[Piece] = []
-        self._rows = 0
 
     def blocks(self, rows: int) -> Iterator[Block]:
-        """The frames, so many or somewhat more a block. Raises what reading the file raises, after the frames before it."""
+        """The frames, so many or somewhat more a block; each block is good until the next is asked for.
+
+        Raises what reading the file raises, after the frames before it.
+        """
+        self._rows = Rows(rows + CHUNK_BYTES // SHORT_LINE)
         try:
-            for text in self._chunks():
-                self._take(text)
-                if self._rows >= rows or len(self._talkers) >= MOST_TALKERS:
+            for _ in self._chunks():
+                if self._rows.count >= rows or len(self._talkers) >= MOST_TALKERS:
                     yield self._block()
         except (EOFError, OSError, zlib.error):
-            if self._rows:
+            if self._rows.count:
                 yield self._block()
             raise
-        if self._rows:
+        if self._rows.count:
             yield self._block()
 
     def _block(self) -> Block:
-        pieces, talkers = self._pieces, self._talkers
-        keys = [key | self._buses[channel] << BUS_SHIFT for channel, key in talkers]
-        if len(pieces) == 1:
-            t_ns, talker, length, head, wide_rows, wide = pieces[0]
-        else:
-            begins = np.cumsum([0, *(len(piece.t_ns) for piece in pieces)]).tolist()
-            t_ns, talker, length, head = (np.concatenate([piece[column] for piece in pieces]) for column in range(4))
-            wide_rows = np.concatenate([piece.wide_rows + begin for piece, begin in zip(pieces, begins, strict=False)])
-            wide = np.concatenate([piece.wide for piece in pieces])
-        self._pieces, self._rows = [], 0
-        if len(talkers) >= MOST_TALKERS:
+        keys = [key | self._buses[channel] << BUS_SHIFT for channel, key in self._talkers]
+        if len(keys) >= MOST_TALKERS:
             self._forget()
-        return Block(t_ns, talker, keys, length, head, wide_rows, wide)
+        return self._rows.block(keys)
 
-    def _chunks(self) -> Iterator[npt.NDArray[np.uint8]]:
-        """The text in pieces of whole lines, with room behind each."""
+    def _chunks(self) -> Iterator[None]:
+        """Take the frames of the text in pieces of whole lines, and stop after each."""
         text = bytearray(CHUNK_BYTES + width_of(LONGEST))
         view, buffer = memoryview(text), np.frombuffer(text, np.uint8)
         filled, error, got = 0, None, 1
@@ -357,7 +409,8 @@ class CandumpBlocks:
                 filled += 1
             end = text.rfind(b"\n", 0, filled) + 1
             if end:
-                yield buffer[:end]
+                self._take(buffer, end)
+                yield
                 text[:filled - end] = text[end:filled]
                 filled -= end
             elif got:
@@ -376,66 +429,105 @@ class CandumpBlocks:
 
     # --- a chunk of whole lines -------------------------------------------------------------------------------------------
 
-    def _take(self, text: npt.NDArray[np.uint8]) -> None:
-        """Add the frames of a chunk of text."""
-        ends = np.flatnonzero(text == _NEWLINE)
+    def _take(self, text: npt.NDArray[np.uint8], size: int) -> None:
+        """Add the frames of the first so many characters of a text, whole lines. Behind them is room for one more."""
+        ends = np.flatnonzero(text[:size] == _NEWLINE)
         starts = np.empty_like(ends)
         starts[0], starts[1:] = 0, ends[:-1] + 1
-        sheet = Sheet(text, starts, ends - starts)
-        for length in np.flatnonzero(np.bincount(np.minimum(sheet.lengths, LONGEST + 1))).tolist():
-            rows = np.flatnonzero(sheet.lengths == length if length <= LONGEST else sheet.lengths > LONGEST)
-            if 0 < length <= LONGEST:
-                self._read_alike(sheet, rows, length)
-            elif length:
-                sheet.left.append(rows)
-        left = np.sort(np.concatenate([_NO_ROWS, *sheet.left])).tolist()
-        if left:
-            self._read_singly(sheet, left)
+        sheet = Sheet(text, starts, ends, self._rows)
+        self._read_log(sheet)
+        if not sheet.found.all():
+            self._read_others(sheet, np.flatnonzero(~sheet.found))
         self._lines += len(ends)
         for _, channel in sorted((row, channel) for channel, row in sheet.channels.items()):
             self._buses[channel] = self._bus(channel.decode("utf-8", "replace"))
-        if piece := sheet.piece():
-            self._pieces.append(piece)
-            self._rows += len(piece.t_ns)
+        self._rows.keep(sheet.found, sheet.wide)
 
-    def _read_alike(self, sheet: Sheet, rows: Ints, length: int) -> None:
-        """Lines of one length, shape by shape."""
-        shapes = self._shapes.setdefault(length, [])
-        lines = sheet.words(rows, length)
-        for number, shape in enumerate(shapes):
-            fits = shape.fits(lines)
-            if not fits.any():
-                continue
-            shapes.insert(0, shapes.pop(number))
-            if fits.all():
-                self._read_shape(sheet, shape, rows, lines)
-                return
-            self._read_shape(sheet, shape, rows[fits], lines[fits])
-            rows, lines = rows[~fits], lines[~fits]
-        while len(rows) >= FEW_LINES:
-            learned = learn(sheet.line(int(rows[0])))
+    def _read_log(self, sheet: Sheet) -> None:
+        """Lines of the log form with up to eight data bytes, as far as they have heads that are known or can be learned."""
+        rows: Ints | None = None
+        for number, head in enumerate(self._heads):
+            lines = sheet.words(rows, head.size + NAME_SIZE)
+            fits = head.fits(lines)
+            if fits.any():
+                self._heads.insert(0, self._heads.pop(number))
+                rows = self._read_head(sheet, head, rows, lines, fits)
+                if not len(rows):
+                    return
+        while rows is None or len(rows) >= FEW_LINES:
+            learned = learn_head(sheet.line(0 if rows is None else int(rows[0])))
             if learned is None:
-                break
+                return
+            self._heads.insert(0, learned)
+            del self._heads[MAX_SHAPES:]
+            lines = sheet.words(rows, learned.size + NAME_SIZE)
+            rows = self._read_head(sheet, learned, rows, lines, learned.fits(lines))
+
+    def _read_head(self, sheet: Sheet, head: Shape, rows: Ints | None, lines: npt.NDArray[np.uint64],
+                   fits: npt.NDArray[np.bool_]) -> Ints:
+        """Read those lines that a head fits; gives the others. rows: lines in question, None for all; lines: their beginnings."""
+        others = _NO_ROWS
+        if not fits.all():
+            others = np.flatnonzero(~fits) if rows is None else rows[~fits]
+            rows = np.flatnonzero(fits) if rows is None else rows[fits]
+            lines = lines[fits]
+        t_ns, wrong = head.times(lines)
+        names = characters(lines, head.size)
+        is_short = names & np.uint64(0xFF00_0000) == np.uint64(_MARK << 24)
+        wrong |= ~is_short & (np.ndarray((len(lines),), np.uint8, lines, head.size + NAME_SIZE - 1, (lines.strides[0],)) != _MARK)
+        talkers = self._names_of(head.channel, 0).of(np.where(is_short, names & np.uint64(0xFF_FFFF), names))
+        wrong |= talkers < 0
+        sizes, heads, wrong_data = sheet.short_data(rows, np.where(is_short, head.size + 4, head.size + NAME_SIZE))
+        wrong |= wrong_data
+        if wrong.any():
+            right = np.flatnonzero(~wrong)
+            rows = right if rows is None else rows[right]
+            t_ns, talkers, sizes, heads = t_ns[right], talkers[right], sizes[right], heads[right]
+        if len(t_ns):
+            sheet.put(rows, head.channel, t_ns, talkers, sizes, heads)
+        return others
+
+    def _read_others(self, sheet: Sheet, rows: Ints) -> None:
+        """All lines but those of the log form."""
+        left = []
+        lengths = sheet.ends[rows] - sheet.starts[rows]
+        for length in np.flatnonzero(np.bincount(np.minimum(lengths, LONGEST + 1))).tolist():
+            if length > LONGEST:
+                left.append(rows[lengths > LONGEST])
+            elif length:
+                left += self._read_alike(sheet, rows[lengths == length], length)
+        self._read_singly(sheet, np.sort(np.concatenate([_NO_ROWS, *left])).tolist())
+
+    def _read_alike(self, sheet: Sheet, rows: Ints, length: int) -> Iterator[Ints]:
+        """Lines of one length, shape by shape; gives those that are to be read one by one."""
+        shapes = self._shapes.setdefault(length, [])
+        for number, shape in enumerate(shapes):
+            lines = sheet.words(rows, length)
+            fits = shape.fits(lines)
+            if fits.any():
+                shapes.insert(0, shapes.pop(number))
+                yield self._read_shape(sheet, shape, rows[fits], lines[fits])
+                rows = rows[~fits]
+        while len(rows) >= FEW_LINES and (learned := learn(sheet.line(int(rows[0])))) is not None:
             shapes.insert(0, learned)
             del shapes[MAX_SHAPES:]
+            lines = sheet.words(rows, length)
             fits = learned.fits(lines)
-            self._read_shape(sheet, learned, rows[fits], lines[fits])
-            rows, lines = rows[~fits], lines[~fits]
-        sheet.left.append(rows)
+            yield self._read_shape(sheet, learned, rows[fits], lines[fits])
+            rows = rows[~fits]
+        yield rows
 
-    def _read_shape(self, sheet: Sheet, shape: Shape, rows: Ints, lines: npt.NDArray[np.uint64]) -> None:
-        """Lines of one shape; those that turn out not to be are left."""
+    def _read_shape(self, sheet: Sheet, shape: Shape, rows: Ints, lines: npt.NDArray[np.uint64]) -> Ints:
+        """Lines of one shape; gives those that turn out not to be."""
         t_ns, wrong = shape.times(lines)
         talkers = self._names_of(shape.channel, shape.flags).of(shape.names(lines))
         payloads, wrong_data = shape.payloads(lines)
         wrong |= wrong_data
         wrong |= talkers < 0
-        if wrong.any():
-            sheet.left.append(rows[wrong])
-            right = ~wrong
-            rows, t_ns, talkers, payloads = rows[right], t_ns[right], talkers[right], payloads[right]
-        if len(rows):
-            sheet.put(rows, shape.channel, t_ns, talkers, payloads)
+        right = ~wrong
+        if right.any():
+            sheet.put_payloads(rows[right], shape.channel, t_ns[right], talkers[right], payloads[right])
+        return rows[wrong]
 
     def _names_of(self, channel: bytes, flags: int) -> Names:
         if (channel, flags) not in self._names:
@@ -456,67 +548,69 @@ class CandumpBlocks:
             except ValueError as error:
                 self._skip(f"unreadable line {self._lines + row + 1}: {error}")
                 continue
-            sheet.put(np.array([row]), channel, np.array([t_ns]), np.array([self._talker(channel, key)], np.int32),
-                      np.frombuffer(data, np.uint8)[None, :])
+            sheet.put_payloads(np.array([row]), channel, np.array([t_ns]), np.array([self._talker(channel, key)], np.int32),
+                               np.frombuffer(data, np.uint8)[None, :])
 
 
 class Sheet:
-    """The lines of a chunk, and their frames as far as they have been read. left: lines that are read one by one, in parts.
+    """The lines of a chunk, from `starts` to `ends` in a text, whose frames go into the next of some rows.
 
-    channels: first row of each channel.
+    found: which lines are frames; wide: lines of those longer than a head, and their payloads; channels: first line of each.
     """
 
-    def __init__(self, text: npt.NDArray[np.uint8], starts: Ints, lengths: Ints):
-        count = len(starts)
-        self.text, self.starts, self.lengths = text, starts, lengths
-        self.left: list[Ints] = []
+    def __init__(self, text: npt.NDArray[np.uint8], starts: Ints, ends: Ints, rows: Rows):
+        self.text, self.starts, self.ends = text, starts, ends
         self.channels: dict[bytes, int] = {}
-        self._wide: list[tuple[Ints, npt.NDArray[np.uint8]]] = []
-        self._t_ns = np.empty(count, np.int64)
-        self._talker = np.full(count, -1, np.int32)
-        self._length = np.empty(count, np.uint16)
-        self._head = np.zeros((count, HEAD_BYTES), np.uint8)
+        self.wide: list[tuple[Ints, npt.NDArray[np.uint8]]] = []
+        self.found = np.zeros(len(starts), bool)
+        self._t_ns, self._talker, self._length, self._head = rows.sheet(len(starts))
 
     def line(self, row: int) -> bytes:
         """A line without its end."""
-        start = self.starts[row]
-        return self.text[start:start + self.lengths[row]].tobytes()
+        return self.text[self.starts[row]:self.ends[row]].tobytes()
 
-    def words(self, rows: Ints, length: int) -> npt.NDArray[np.uint64]:
-        """Lines of this length, eight characters a column."""
-        width = width_of(length)
-        everywhere = np.ndarray((len(self.text),), f"V{width}", self.text.base, 0, (1,))
-        return everywhere[self.starts[rows]].view("<u8").reshape(len(rows), width // 8)
+    def words(self, rows: Ints | None, length: int) -> npt.NDArray[np.uint64]:
+        """The first so many characters of some lines (None: all) or a few more, eight a column."""
+        return self._at(self.starts if rows is None else self.starts[rows], width_of(length))
 
-    def put(self, rows: Ints, channel: bytes, t_ns: Ints, talkers: npt.NDArray[np.int32], payloads: npt.NDArray[np.uint8]) -> None:
-        """Frames of some lines, all of one channel and size."""
+    def _at(self, places: Ints, width: int) -> npt.NDArray[np.uint64]:
+        """So many characters from these places on; what lies behind the end of a line is another one, or nothing."""
+        everywhere = np.ndarray((len(self.text) - width,), f"V{width}", self.text, 0, (1,))
+        return everywhere[places].view("<u8").reshape(len(places), width // 8)
+
+    def short_data(self, rows: Ints | None, offsets: Ints) -> tuple[npt.NDArray[np.uint16], Words, npt.NDArray[np.bool_]]:
+        """Sizes and heads of payloads of up to eight bytes that begin at these places of their lines and end with them; and
+        which are none."""
+        begins = (self.starts if rows is None else self.starts[rows]) + offsets
+        digits = (self.ends if rows is None else self.ends[rows]) - begins
+        values = HEX_PAIRS.take(self._at(begins, 16).view("<u2"), mode="clip")
+        wrong = np.zeros(len(begins), bool)
+        if digits.min() != 16 or digits.max() != 16:
+            wrong = (digits < 0) | (digits > 16) | (digits & 1 != 0)
+            some = np.flatnonzero(digits != 16)
+            part = values[some]
+            part[np.arange(HEAD_BYTES) >= digits[some, None] >> 1] = 0
+            values[some] = part
+        if int(values.max(initial=0)) > 0xFF:
+            wrong |= np.any(values > 0xFF, axis=1)
+        return (digits >> 1).astype(np.uint16), values.astype(np.uint8).view("<u8")[:, 0], wrong
+
+    def put(self, rows: Ints | None, channel: bytes, t_ns: Ints, talkers: npt.NDArray[np.int32], sizes: Any, heads: Words) -> None:
+        """Frames of some lines (None: all), all of one channel."""
+        chosen: Any = slice(None) if rows is None else rows
+        self.channels[channel] = min(0 if rows is None else int(rows[0]), self.channels.get(channel, len(self.starts)))
+        self._t_ns[chosen] = t_ns
+        self._talker[chosen] = talkers
+        self._length[chosen] = sizes
+        self._head[chosen] = heads
+        self.found[chosen] = True
+
+    def put_payloads(self, rows: Ints, channel: bytes, t_ns: Ints, talkers: npt.NDArray[np.int32],
+                     payloads: npt.NDArray[np.uint8]) -> None:
+        """Frames of some lines, all of one channel and size, with their data bytes, a row a frame."""
         size = payloads.shape[1]
-        self.channels[channel] = min(int(rows[0]), self.channels.get(channel, len(self.starts)))
-        self._t_ns[rows] = t_ns
-        self._talker[rows] = talkers
-        self._length[rows] = size
-        if size == HEAD_BYTES:
-            self._head.view(np.uint64)[rows] = payloads.view(np.uint64)
-        else:
-            self._head[rows, :size] = payloads[:, :HEAD_BYTES]
+        heads = np.zeros((len(rows), HEAD_BYTES), np.uint8)
+        heads[:, :size] = payloads[:, :HEAD_BYTES]
         if size > HEAD_BYTES:
-            self._wide.append((rows, payloads))
-
-    def piece(self) -> Piece | None:
-        """All frames, in order; None when there is none."""
-        wide_rows = np.concatenate([_NO_ROWS, *(rows for rows, _ in self._wide)])
-        wide = np.zeros((len(wide_rows), FD_BYTES + HEAD_BYTES), np.uint8)
-        place = 0
-        for rows, payloads in self._wide:
-            wide[place:place + len(rows), :payloads.shape[1]] = payloads
-            place += len(rows)
-        order = np.argsort(wide_rows)
-        found = self._talker >= 0
-        head = self._head.view("<u8")[:, 0]
-        if found.all():
-            return Piece(self._t_ns, self._talker.astype(np.uint16), self._length, head, wide_rows[order], wide[order])
-        if not found.any():
-            return None
-        wide_rows = (np.cumsum(found) - 1)[wide_rows]
-        return Piece(self._t_ns[found], self._talker[found].astype(np.uint16), self._length[found], head[found], wide_rows[order],
-                     wide[order])
+            self.wide.append((rows, payloads))
+        self.put(rows, channel, t_ns, talkers, size, heads.view("<u8")[:, 0])

@@ -101,7 +101,10 @@ class Log:
                 yield frame
 
     def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[Block]:
-        """The frames in columns, so many rows a block or somewhat more; otherwise as `frames`."""
+        """The frames in columns, so many rows a block or somewhat more; otherwise as `frames`.
+
+        A block is good until the next is asked for.
+        """
         with self._reading():
             for block in self._read_blocks(rows):
                 if not self.frames_read:

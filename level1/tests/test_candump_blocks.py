@@ -101,8 +101,7 @@ def test_lines_of_one_kind_are_read_together(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(candump_blocks.CandumpBlocks, "_read_singly", lambda *_: pytest.fail("read singly"))
     file = tmp_path / "a.log"
     file.write_text("".join(lines))
-    blocks = list(Log(file).blocks())
-    assert sum(map(len, blocks)) == 5000 and len(asked) == 2
+    assert sum(map(len, Log(file).blocks())) == 5000 and len(asked) == 2
 
 
 def test_blocks_are_of_the_size_asked_for_or_a_chunk_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
