@@ -57,15 +57,13 @@ class Table:
     it."""
 
     def __init__(self) -> None:
-        self._size = 0
+        self._make_room(0)
 
     def _make_room(self, rows: int) -> None:
-        if rows > self._size:
-            self._size = rows
-            self._t_ns = np.empty(rows, np.int64)
-            self._gaps = np.empty(rows, np.int64)
-            self._heads = np.empty(rows, np.uint64)
-            self._changed = np.empty(rows, bool)
+        self._t_ns = np.empty(rows, np.int64)
+        self._gaps = np.empty(rows, np.int64)
+        self._heads = np.empty(rows, np.uint64)
+        self._changed = np.empty(rows, bool)
 
     def deal(self, block: Block, t_ns: Ints, numbers: list[int], trees: int) -> Deal:
         """Sort the rows of a block by tree, in order of time within each; the result holds until the next block is dealt.
@@ -82,7 +80,8 @@ class Table:
             rows = np.argsort(lots, kind="stable")[:len(block) - counts[trees]]
         bounds = np.concatenate(([0], np.cumsum(counts[:trees])))
         starts = bounds[:-1][counts[:trees] > 0]
-        self._make_room(len(rows))
+        if len(rows) > len(self._t_ns):
+            self._make_room(len(rows))
         times, heads, changed = self._t_ns[:len(rows)], self._heads[:len(rows)], self._changed[:len(rows)]
         t_ns.take(rows, out=times, mode="clip")
         block.head.take(rows, out=heads, mode="clip")
