@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -35,6 +36,8 @@ GUESTS = 2
 
 def pytest_configure(config: pytest.Config) -> None:
     """In the guest: run what was selected outside, and hand the reports over."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the background by a shell: tests of Ctrl-C need it
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     listed = os.environ.pop(SELECTED, "")
     if listed:
         config.pluginmanager.register(GuestSide(config, Path(listed).read_text().splitlines()))
