@@ -12,7 +12,7 @@ from level1.frame import Frame
 HEAD_BYTES = 8
 """Payload bytes that every frame has in the column `head`."""
 MAX_TALKERS = 65_536
-"""Different keys that one block can hold: a recording of random identifiers is cut into more blocks."""
+"""Different keys that 16 bits can number: readers cut a recording of random identifiers into more blocks."""
 
 Ints = npt.NDArray[np.int64]
 Words = npt.NDArray[np.uint64]
@@ -54,6 +54,12 @@ class Block:
         wide = np.frombuffer(b"".join(rows[row][2].ljust(longest, b"\0") for row in wide_rows), np.uint8)
         return cls(np.array([t_ns for t_ns, _, _ in rows], np.int64), talker, list(numbers), length, head.astype(np.uint64),
                    wide_rows, wide.reshape(len(wide_rows), longest))
+
+    def first_rows(self) -> Ints:
+        """The first row of each talker; 0 for one that has none."""
+        rows = np.zeros(len(self.keys), np.int64)
+        rows[self.talker[::-1]] = np.arange(len(self) - 1, -1, -1)
+        return rows
 
     def counts(self) -> list[int]:
         """How many frames each talker has in the block."""

@@ -40,6 +40,13 @@ def clamped(t_ns: Ints, last_ns: int) -> tuple[Ints, int]:
     return raised, int(np.count_nonzero(raised != t_ns))
 
 
+class Talkers(NamedTuple):
+    """Of each talker of a block the number of its tree (or `NOBODY`, `FED`), and how many rows it has."""
+
+    numbers: list[int]
+    counts: list[int]
+
+
 class Deal(NamedTuple):
     """The rows of a block, sorted by tree; `bounds`: where the trees begin, and the end. changed: payload differs from the row
     before; longest: gap between two rows of a tree, ns."""
@@ -65,14 +72,11 @@ class Table:
         self._heads = np.empty(rows, np.uint64)
         self._changed = np.empty(rows, bool)
 
-    def deal(self, block: Block, t_ns: Ints, numbers: list[int], trees: int) -> Deal:
-        """Sort the rows of a block by tree, in order of time within each; the result holds until the next block is dealt.
-
-        numbers: tree of each talker, negative for none.
-        """
-        lot = np.array([number if number >= 0 else trees for number in numbers])
+    def deal(self, block: Block, t_ns: Ints, talkers: Talkers, trees: int) -> Deal:
+        """Sort the rows of a block by tree, in order of time within each; the result holds until the next block is dealt."""
+        lot = np.array([number if number >= 0 else trees for number in talkers.numbers])
         lots: npt.NDArray[Any] = lot.astype(np.uint8 if trees < 256 else np.uint16).take(block.talker)
-        counts = np.bincount(lots, minlength=trees + 1)
+        counts = np.bincount(lot, talkers.counts, trees + 1).astype(np.int64)
         if counts[trees] * 2 > len(block):
             some = np.flatnonzero(lots < trees)
             rows = some[np.argsort(lots[some], kind="stable")]
@@ -200,9 +204,9 @@ class Answer:
 
 
 class Passage:
-    """Drives a supervisor through one block. t_ns: its time stamps, none running backwards; numbers: tree of each talker."""
+    """Drives a supervisor through one block. t_ns: its time stamps, none running backwards."""
 
-    def __init__(self, supervisor: Supervisor, plan: Plan, table: Table, block: Block, t_ns: Ints, numbers: list[int]):
+    def __init__(self, supervisor: Supervisor, plan: Plan, table: Table, block: Block, t_ns: Ints, talkers: Talkers):
         self.board: Board = supervisor.board
         self._meet = supervisor.meet
         self._timers = supervisor.timers
@@ -216,12 +220,12 @@ class Passage:
         self._fed: list[Ints] = []
         self._moved: set[Column] = set()
         self._ends: dict[int, list[PagePassage]] = {}
-        if FED in numbers:
-            self._fed.append(np.flatnonzero(np.array([number == FED for number in numbers])[block.talker]))
-        strangers = [place for place, key in enumerate(block.keys) if key not in self.board.table]
+        if FED in talkers.numbers:
+            self._fed.append(np.flatnonzero(np.array([number == FED for number in talkers.numbers])[block.talker]))
+        strangers = [place for place, key in enumerate(block.keys) if key not in self.board.table and talkers.counts[place]]
         if strangers:
-            self._fed.append(first_rows(block)[strangers])
-        silences = self._follow_times(table, numbers)
+            self._fed.append(block.first_rows()[strangers])
+        silences = self._follow_times(table, talkers)
         self._deadlines = [(silence.due_ns, silence.order) for silence in silences]
         self._before = t_ns.searchsorted(np.array([silence.due_ns for silence in silences], np.int64), "left")
         self._deadline_slots = self._before + np.arange(len(silences))
@@ -232,10 +236,10 @@ class Passage:
 
     # --- on columns -------------------------------------------------------------------------------------------------------
 
-    def _follow_times(self, table: Table, numbers: list[int]) -> list[Silence]:
+    def _follow_times(self, table: Table, talkers: Talkers) -> list[Silence]:
         """Give each page its rows, and find all silences, in the order of their deadlines."""
         plan, end_ns = self._plan, int(self._t_ns[-1])
-        dealt = table.deal(self._block, self._t_ns, numbers, max(plan.roots, default=-1) + 1)
+        dealt = table.deal(self._block, self._t_ns, talkers, max(plan.roots, default=-1) + 1)
         silences: list[Silence] = []
         for number, root in plan.roots.items():
             part = slice(dealt.bounds[number], dealt.bounds[number + 1])
@@ -521,13 +525,6 @@ def _bell(watch: Watch) -> Cell:
     cell = Cell("", 0)
     cell.watches.append(watch)
     return cell
-
-
-def first_rows(block: Block) -> Ints:
-    """The first row of each talker."""
-    rows = np.zeros(len(block.keys), np.int64)
-    rows[block.talker[::-1]] = np.arange(len(block) - 1, -1, -1)
-    return rows
 
 
 def _merge(parts: list[Ints]) -> tuple[Ints, list[Ints]]:

@@ -35,7 +35,7 @@ from level1.event import Output
 from level1.expression import AlarmState, Count, ExpectStep
 from level1.frame import BUS_SHIFT, EXTENDED, frame_key, j1939_pgn
 from level1.j1939 import TP_CM
-from level1.passage import FED, NOBODY, Passage, Table, clamped
+from level1.passage import FED, NOBODY, Passage, Table, Talkers, clamped
 from level1.supervisor import Supervisor
 
 LEAST_ROWS = 64
@@ -188,12 +188,12 @@ class Sieve:
         t_ns, backwards = clamped(block.t_ns, self.supervisor.now_ns)
         if backwards:
             self.supervisor.counters["time stamps that ran backwards"] += backwards
-        numbers, loose = self._assign(block, t_ns)
-        plan = self._plan(loose)
-        Passage(self.supervisor, plan, self._table, block, t_ns, numbers).run()
+        counts = block.counts()
+        numbers, loose = self._assign(block, counts, t_ns)
+        Passage(self.supervisor, self._plan(loose), self._table, block, t_ns, Talkers(numbers, counts)).run()
         return self.supervisor.take(int(t_ns[-1]))
 
-    def _assign(self, block: Block, t_ns: Ints) -> tuple[list[int], frozenset[int]]:
+    def _assign(self, block: Block, counts: list[int], t_ns: Ints) -> tuple[list[int], frozenset[int]]:
         """For each talker of a block the number of its tree, `NOBODY` or `FED`; and the trees that are not tracked in it."""
         if len(self._kinds) > MAX_KEYS:
             self._kinds.clear()
@@ -204,7 +204,8 @@ class Sieve:
             if kind is None:
                 kind = self._kinds[key] = self._kind(key)
             if isinstance(kind, Group):
-                groups.setdefault(kind, []).append(place)
+                if counts[place]:
+                    groups.setdefault(kind, []).append(place)
                 kind = NOBODY
             numbers.append(kind)
         loose = self._packed(block)

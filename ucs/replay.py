@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TextIO
 
 from level1.catalog import NORMAL, Catalog
-from level1.event import Event, Send, encode, seconds
+from level1.event import Event, Output, Send, encode, seconds
 from level1.frame import Frame
 from level1.freeze_frame import STATE_WORDS
 from level1.io import config, definitions
@@ -56,6 +56,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--speed", type=onto.speed, metavar="N", help="with --onto: so many times faster than recorded (1)")
     parser.add_argument("--interface", metavar="NAME", help=f"with --onto: any interface of python-can ({onto.INTERFACE})")
     parser.add_argument("--bitrate", type=int, metavar="N", help="with --onto: bit/s, for interfaces that need it")
+    parser.add_argument("--scalar", action="store_true", help="read and evaluate frame by frame; slower, with the same events")
     parser.add_argument("--merge", action="store_true", help="the recordings are of one drive: one run, in the order of time")
     add_season_arguments(parser)
 
@@ -76,7 +77,8 @@ def run(args: Namespace) -> int:
     if unit:
         config.check_armed(unit, catalog)
     task = _Task(catalog, tuple(unit.repairs.armed) if unit else None,
-                 {**(_bus_names(unit) if unit and not args.dbc else {}), **dict(args.bus)}, tuple(name for name, _ in args.bus))
+                 {**(_bus_names(unit) if unit and not args.dbc else {}), **dict(args.bus)}, tuple(name for name, _ in args.bus),
+                 False if args.scalar else None)
     if args.onto:
         return _run_onto(paths, task, args)
     with ExitStack() as stack:
@@ -95,28 +97,32 @@ class _Task(NamedTuple):
     armed: tuple[str, ...] | None
     buses: dict[str, int]
     asked: tuple[str, ...]
+    blocks: bool | None = None
 
     def replay(self, paths: Sequence[str], through: Through | None = None) -> Replay:
         """Of one recording, or of several as one. Raises LogError."""
         one_bus = not self.buses
         log = Log(paths[0], self.buses, one_bus=one_bus) if len(paths) == 1 else MergedLog(paths, self.buses, one_bus=one_bus)
-        return Replay(log, self.catalog, self.armed, through)
+        return Replay(log, self.catalog, self.armed, through, self.blocks)
 
     def job(self, path: str, catalog: bytes) -> season.Job:
         """The same, for another process."""
-        return season.Job(path, catalog, self.armed, self.buses, self.asked)
+        return season.Job(path, catalog, self.armed, self.buses, self.asked, self.blocks)
 
 
 class Replay:
     """A recording run through a supervisor of its own.
 
     through: what takes the batches of frames on their way and hands them on (plays, draws), None for nothing.
+    blocks: frames in columns (`level1.sieve`) or one by one, which gives the same events; None: whatever is sooner done.
     counts: (alarm, event) -> how often. sends: frames that repairs would have sent. keys: of all frames seen.
     """
 
-    def __init__(self, log: Log | MergedLog, catalog: Catalog, armed: Collection[str] | None, through: Through | None = None):
+    def __init__(self, log: Log | MergedLog, catalog: Catalog, armed: Collection[str] | None, through: Through | None = None,
+                 blocks: bool | None = None):
         self.log = log
         self.through = through
+        self._blocks = through is None and (log.is_long if blocks is None else blocks)
         self.supervisor = Supervisor(catalog, unit=UNIT, boot=BOOT, armed=armed, broadcast=False)
         self.counts: Counter[tuple[str, str]] = Counter()
         self.sends = 0
@@ -124,13 +130,29 @@ class Replay:
 
     def batches(self) -> Iterator[list[Event]]:
         """The events, a list for each batch of frames; ends with the deadlines up to the last time stamp."""
+        for outputs in self._in_blocks() if self._blocks else self._one_by_one():
+            yield self._events(outputs)
+        yield self._events(self.supervisor.tick(self.log.last_ns))
+
+    def _one_by_one(self) -> Iterator[Sequence[Output]]:
         batches = self.log.batches()
         for batch in self.through(batches) if self.through else batches:
-            if self.log.is_utc:
-                self.supervisor.utc_offset_ns = 0
+            self._begin()
             self.keys.update([frame.key for frame in batch])
-            yield self._events(self.supervisor.receive_many(batch))
-        yield self._events(self.supervisor.tick(self.log.last_ns))
+            yield self.supervisor.receive_many(batch)
+
+    def _in_blocks(self) -> Iterator[Sequence[Output]]:
+        from level1.sieve import Sieve  # numpy takes a tenth of a second to import
+        sieve = Sieve(self.supervisor)
+        for block in self.log.blocks():
+            self._begin()
+            self.keys.update(block.keys)
+            yield sieve.receive(block)
+
+    def _begin(self) -> None:
+        """The first time stamp has been read: is it of the wall clock?"""
+        if self.log.is_utc:
+            self.supervisor.utc_offset_ns = 0
 
     def outcome(self, asked: Iterable[str], events: tuple[bytes, ...] = ()) -> season.Outcome:
         """What came of it, once all batches were taken. asked: channels that the user named."""

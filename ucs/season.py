@@ -32,13 +32,14 @@ SUFFIXES = (".log", ".candump", ".txt", ".asc", ".blf", ".trc", ".csv", ".mf4", 
 
 class Job(msgspec.Struct, frozen=True):
     """A recording and what to run over it. catalog: a `Catalog` as msgpack; armed: alarms whose repairs act, None for all.
-    asked: channels that the user named."""
+    asked: channels that the user named. blocks: as in `replay.Replay`."""
 
     path: str
     catalog: bytes
     armed: tuple[str, ...] | None = None
     buses: dict[str, int] = {}
     asked: tuple[str, ...] = ()
+    blocks: bool | None = None
 
     def key(self) -> str:
         """Names the outcome: the same key, the same bytes."""
@@ -108,7 +109,7 @@ def work(job: Job) -> Outcome:
     from ucs.replay import Replay
     try:
         log = Log(job.path, job.buses, one_bus=not job.buses)
-        replay = Replay(log, msgspec.msgpack.decode(job.catalog, type=Catalog), job.armed)
+        replay = Replay(log, msgspec.msgpack.decode(job.catalog, type=Catalog), job.armed, blocks=job.blocks)
         events = tuple(encode(event) for batch in replay.batches() for event in batch)
     except (OutsideError, OSError) as error:
         return Outcome(job.path, error=str(error))

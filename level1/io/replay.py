@@ -39,6 +39,8 @@ BLOCK_ROWS = 1 << 18
 """Frames in a block: enough that what each block costs does not matter, some tens of megabytes of memory."""
 SINGLE_ROWS = 1 << 14
 """Frames in a block of a format that is read frame by frame: each is an object first."""
+LONG_BYTES = 1 << 20
+"""Recordings from this size on, some 20,000 frames, are read in blocks."""
 EPOCH_NS = 1_000_000_000 * 10**9
 """Stamps above (9 September 2001) are UTC; below they count from the recording's start."""
 
@@ -85,6 +87,11 @@ class Log:
         return 1.0 if self._raw.closed else self._raw.tell() / self._size
 
     @property
+    def is_long(self) -> bool:
+        """Whether reading it in blocks saves more time than it takes to begin with (numpy and tables must be made ready)."""
+        return self._size >= LONG_BYTES
+
+    @property
     def is_utc(self) -> bool:
         """Whether the stamps are UTC rather than counted from the recording's start."""
         return self.first_ns >= EPOCH_NS
@@ -129,9 +136,10 @@ class Log:
         if self._read == self._candump:
             from level1.io.candump_blocks import CandumpBlocks
             for block in CandumpBlocks(self._file, self.bus, self._skip).blocks(rows):
-                counts = block.counts()
-                self.error_frames += sum(count for key, count in zip(block.keys, counts, strict=True) if key & ERROR)
-                self.remote_frames += sum(count for key, count in zip(block.keys, counts, strict=True) if key & REMOTE)
+                if any(key & (ERROR | REMOTE) for key in block.keys):
+                    counts = block.counts()
+                    self.error_frames += sum(count for key, count in zip(block.keys, counts, strict=True) if key & ERROR)
+                    self.remote_frames += sum(count for key, count in zip(block.keys, counts, strict=True) if key & REMOTE)
                 yield block
             return
         frames = self._read()

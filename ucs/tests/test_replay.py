@@ -11,6 +11,7 @@ import pytest
 
 from level1.decode import encode
 from level1.event import decode
+from level1.io import replay as recordings
 from level1.io.definitions import load
 from ucs.main import main
 
@@ -177,3 +178,33 @@ def test_real_tractor_recordings_raise_what_was_wrong_and_nothing_else(replay: R
 def test_every_line_is_an_event(replay: Run, flame_lost: Path) -> None:
     _, out, _ = replay(flame_lost, "--dbc", "flaming_tool.dbc", "--events", "-")
     assert all(decode(line).unit == "replay" and msgspec.json.decode(line)["boot"] == 1 for line in out.splitlines())
+
+
+def season_of(path: Path, times: int) -> str:
+    """a recording so many times in a row, a minute apart, with every fifth line damaged in the last of them."""
+    lines = []
+    for number in range(times):
+        for place, line in enumerate(path.read_text().splitlines()):
+            seconds, rest = line[1:].split(".", 1)
+            lines.append(f"({int(seconds) + 60 * number}.{rest if place % 5 or number < times - 1 else rest[:-3]}\n")
+    return "".join(lines)
+
+
+def test_blocks_and_single_frames_give_the_same_bytes(replay: Run, flame_lost: Path, tmp_path: Path,
+                                                      monkeypatch: pytest.MonkeyPatch) -> None:
+    """In one file, in several merged, and in many: what `--scalar` gives."""
+    log, other = tmp_path / "long.log", tmp_path / "other.log"
+    log.write_text(season_of(flame_lost, 4))
+    other.write_text("".join(f"({START_S + n / 10:.6f}) can0 18FEF1{n % 3:02X}#{n:016X}\n" for n in range(2000)))
+    monkeypatch.setattr(recordings, "LONG_BYTES", 1000)
+    told = {}
+    for way in ("blocks", "--scalar"):
+        for kind, files in (("one", [log]), ("merged", [other, log, "--merge"]), ("season", [log, other])):
+            monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / way))
+            out = tmp_path / f"{way}{kind}"
+            code, _, remarks = replay(*files, "--dbc", "flaming_tool.dbc", "ucs.dbc", "--events", out, "--jobs", 1,
+                                      *([way] if way.startswith("--") else []))
+            told[way, kind] = code, out.read_bytes(), remarks
+    for kind in ("one", "merged", "season"):
+        assert told["blocks", kind] == told["--scalar", kind]
+        assert told["blocks", kind][1].count(b'"raised"') >= 4 and "lines skipped" in told["blocks", kind][2]
