@@ -23,6 +23,7 @@ import numpy.typing as npt
 from level1.block import HEAD_BYTES, Block, Ints, Words
 from level1.frame import BUS_SHIFT, REMOTE
 from level1.io.candump import BYTES, DATE, LATEST_NS, LOG, SCREEN, STAMP, candump_line, spelled_id
+from level1.io.rows import MOST_TALKERS, Numbers, Rows
 
 LONGEST = 256
 """Longer lines are left to the scalar reader; a CAN FD frame of 64 bytes takes 250 characters on the screen at most."""
@@ -32,14 +33,10 @@ MAX_SHAPES = 24
 """Shapes remembered for each length of a line."""
 SHORT_LINE = 24
 """Characters of a short line; where lines are shorter still, a block gets more room when it needs it."""
-MOST_TALKERS = 32_768
-"""A block ends before it has many more talkers than that: of random identifiers, a chunk brings a new one each line."""
 CHUNK_BYTES = 1 << 18
 """Text taken apart at a time; small enough for the second-level cache of a processor."""
 
 HEXADECIMAL = re.compile(rb"[0-9A-Fa-f]+")
-_HASH = np.uint64(0x9E37_79B9_7F4A_7C15)
-_SLOTS = 1 << 16
 _NEWLINE, _MARK = b"\n#"
 NAME_SIZE = 9
 """Characters of the longest identifier and the mark behind it."""
@@ -261,91 +258,6 @@ def _screen_data(match: Any, count: int) -> _DataPlaces | None:
     return (begin, step, count), ((begin + shown[0] + 1, begin + shown[1]),) if 0 <= shown[0] < shown[1] else ()
 
 
-class Names:
-    """Identifiers as they are spelled, to talkers. number(flagged identifier): the talker of one."""
-
-    def __init__(self, number: Callable[[int], int]):
-        self._number = number
-        self._texts = np.zeros(_SLOTS, np.uint64)
-        self._talkers = np.zeros(_SLOTS, np.int32)
-        self._others: dict[int, int] = {}
-
-    def of(self, names: Words) -> npt.NDArray[np.int32]:
-        """The talkers of identifiers; negative where one is none."""
-        slots = (names * _HASH >> np.uint64(48)).view(np.int64)
-        talkers = self._talkers.take(slots)
-        unknown = np.flatnonzero(self._texts.take(slots) != names)
-        if len(unknown):
-            for word in np.unique(names[unknown]).tolist():
-                talkers[unknown[names[unknown] == word]] = self._meet(word)
-        return talkers
-
-    def _meet(self, word: int) -> int:
-        """The talker of an identifier that is not in its slot of the table."""
-        if word not in self._others:
-            self._others[word] = self._resolve(word)
-            slot = word * int(_HASH) % (1 << 64) >> 48
-            if not self._texts[slot]:
-                self._texts[slot], self._talkers[slot] = word, self._others[word]
-        return self._others[word]
-
-    def _resolve(self, word: int) -> int:
-        name = word.to_bytes(8, "little").rstrip(b"\0")
-        try:
-            return self._number(spelled_id(name)) if HEXADECIMAL.fullmatch(name) else -1
-        except ValueError:
-            return -1
-
-
-class Rows:
-    """The rows of a block that is being filled; the same memory for every block, because fresh memory is slow. count: so far."""
-
-    def __init__(self, rows: int):
-        self.count = 0
-        self._t_ns = np.empty(rows, np.int64)
-        self._talker = np.empty(rows, np.uint16)
-        self._length = np.empty(rows, np.uint16)
-        self._head = np.empty(rows, np.uint64)
-        self._wide: list[tuple[Ints, npt.NDArray[np.uint8]]] = []
-
-    def sheet(self, lines: int) -> tuple[Ints, npt.NDArray[np.uint16], npt.NDArray[np.uint16], Words]:
-        """Room for the frames of so many lines: times, talkers, lengths, heads."""
-        part = slice(self.count, self.count + lines)
-        if part.stop > len(self._t_ns):
-            for name in ("_t_ns", "_talker", "_length", "_head"):
-                column = getattr(self, name)
-                setattr(self, name, np.concatenate((column[:self.count], np.empty(lines, column.dtype))))
-        return self._t_ns[part], self._talker[part], self._length[part], self._head[part]
-
-    def keep(self, found: npt.NDArray[np.bool_], wide: list[tuple[Ints, npt.NDArray[np.uint8]]]) -> None:
-        """Those lines of the last sheet are frames. wide: lines of frames that are longer than a head, and their payloads."""
-        lines, begin, places = len(found), self.count, np.arange(len(found))
-        self.count += lines
-        if not found.all():
-            kept = int(np.count_nonzero(found))
-            for column in (self._t_ns, self._talker, self._length, self._head):
-                column[begin:begin + kept] = column[begin:begin + lines][found]
-            self.count = begin + kept
-            places = np.cumsum(found) - 1
-        self._wide += [(places[rows] + begin, payloads) for rows, payloads in wide]
-
-    def block(self, keys: list[int]) -> Block:
-        """All rows; they are good until the next sheet is taken."""
-        count, self.count = self.count, 0
-        wide_rows = np.concatenate([_NO_ROWS, *(rows for rows, _ in self._wide)])
-        longest = max((payloads.shape[1] for _, payloads in self._wide), default=0)
-        wide = np.zeros((len(wide_rows), longest + HEAD_BYTES), np.uint8)
-        place = 0
-        for rows, payloads in self._wide:
-            wide[place:place + len(rows), :payloads.shape[1]] = payloads
-            place += len(rows)
-        order = np.argsort(wide_rows)
-        self._wide = []
-        block = Block(self._t_ns[:count], self._talker[:count], keys, self._length[:count], self._head[:count], wide_rows[order],
-                      wide[order])
-        return block
-
-
 class CandumpBlocks:
     """Reads candump text in blocks.
 
@@ -367,7 +279,7 @@ class CandumpBlocks:
     def _forget(self) -> None:
         """Begin a block: no talker is known."""
         self._talkers: dict[tuple[bytes, int], int] = {}
-        self._names: dict[tuple[bytes, int], Names] = {}
+        self._names: dict[tuple[bytes, int], Numbers] = {}
 
     def blocks(self, rows: int) -> Iterator[Block]:
         """The frames, so many or somewhat more a block; each block is good until the next is asked for.
@@ -529,10 +441,18 @@ class CandumpBlocks:
             sheet.put_payloads(rows[right], shape.channel, t_ns[right], talkers[right], payloads[right])
         return rows[wrong]
 
-    def _names_of(self, channel: bytes, flags: int) -> Names:
+    def _names_of(self, channel: bytes, flags: int) -> Numbers:
         if (channel, flags) not in self._names:
-            self._names[channel, flags] = Names(lambda key: self._talker(channel, key | flags))
+            self._names[channel, flags] = Numbers(lambda word: self._resolve(channel, flags, word))
         return self._names[channel, flags]
+
+    def _resolve(self, channel: bytes, flags: int, word: int) -> int:
+        """The talker of an identifier as it is spelled, negative where it is none."""
+        name = word.to_bytes(8, "little").rstrip(b"\0")
+        try:
+            return self._talker(channel, spelled_id(name) | flags) if HEXADECIMAL.fullmatch(name) else -1
+        except ValueError:
+            return -1
 
     def _talker(self, channel: bytes, key: int) -> int:
         return self._talkers.setdefault((channel, key), len(self._talkers))

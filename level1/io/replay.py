@@ -72,6 +72,7 @@ class Log:
         self.frames_read = self.error_frames = self.remote_frames = self.skipped = 0
         self.first_ns = self.last_ns = 0
         self.complaints: list[str] = []
+        self._columns: Callable[[int], Iterator[Block]] | None = None
         self._raw, self._size = _open(self.path)
         packed = self.path.suffix.lower() == ".gz"
         self._file = cast(BinaryIO, gzip.GzipFile(fileobj=self._raw)) if packed else self._raw
@@ -133,18 +134,35 @@ class Log:
 
     def _read_blocks(self, rows: int) -> Iterator[Block]:
         from level1.block import Block
-        if self._read == self._candump:
-            from level1.io.candump_blocks import CandumpBlocks
-            for block in CandumpBlocks(self._file, self.bus, self._skip).blocks(rows):
-                if any(key & (ERROR | REMOTE) for key in block.keys):
-                    counts = block.counts()
-                    self.error_frames += sum(count for key, count in zip(block.keys, counts, strict=True) if key & ERROR)
-                    self.remote_frames += sum(count for key, count in zip(block.keys, counts, strict=True) if key & REMOTE)
-                yield block
+        if self._columns is not None:
+            yield from self._counted_blocks(self._columns(rows))
             return
         frames = self._read()
         while batch := list(itertools.islice(frames, min(rows, SINGLE_ROWS))):
             yield Block.of(batch)
+
+    def _counted_blocks(self, blocks: Iterator[Block]) -> Iterator[Block]:
+        """The blocks, their error and remote frames counted."""
+        for block in blocks:
+            if any(key & (ERROR | REMOTE) for key in block.keys):
+                counts = block.counts()
+                self.error_frames += sum(count for key, count in zip(block.keys, counts, strict=True) if key & ERROR)
+                self.remote_frames += sum(count for key, count in zip(block.keys, counts, strict=True) if key & REMOTE)
+            yield block
+
+    def _from_blocks(self) -> Iterator[Frame]:
+        """Frame by frame what only a reader of blocks can read."""
+        assert self._columns is not None
+        for block in self._counted_blocks(self._columns(SINGLE_ROWS)):
+            yield from block.frames()
+
+    def _candump_blocks(self, rows: int) -> Iterator[Block]:
+        from level1.io.candump_blocks import CandumpBlocks
+        return CandumpBlocks(self._file, self.bus, self._skip).blocks(rows)
+
+    def _blf_blocks(self, rows: int) -> Iterator[Block]:
+        from level1.io.blf_blocks import BlfBlocks
+        return BlfBlocks(self._file, self.bus, self._skip).blocks(rows)
 
     def batches(self, size: int = 4096) -> Iterator[list[Frame]]:
         """The frames in lists of at most `size`."""
@@ -173,9 +191,13 @@ class Log:
         suffix = next((suffix for suffix in _SUFFIXES if name.endswith(suffix)), "")
         if _GVRET_HEAD.match(head):
             return self._gvret
+        if suffix == ".blf" or head.startswith(b"LOGG"):
+            self._columns = self._blf_blocks
+            return self._from_blocks
         if suffix:
             return lambda: self._python_can(suffix)
         if any(map(is_candump, head.splitlines())):
+            self._columns = self._candump_blocks
             return self._candump
         raise LogError(f"{self.path}: no recording of a known format; {_HINT}")
 
@@ -237,10 +259,10 @@ class Log:
         """Any other format, through python-can's reader of that suffix."""
         from can.io.player import MESSAGE_READERS
         reader = MESSAGE_READERS[suffix]
-        first_channel = 1 if suffix in (".asc", ".blf") else 0  # python-can counts these from 0, the files from 1
+        first_channel = 1 if suffix == ".asc" else 0  # python-can counts these from 0, the files from 1
         with _warnings_as(lambda text: self._skip(f"unreadable: {text}")):
-            if suffix in (".blf", ".mf4"):
-                messages = self._binary(reader, suffix)
+            if suffix == ".mf4":
+                messages = self._binary(reader)
             else:
                 messages = self._text(reader, suffix)
             for message in messages:
@@ -253,10 +275,10 @@ class Log:
                     continue
                 yield self._counted(t_ns, key | self.bus(name) << BUS_SHIFT, data)
 
-    def _binary(self, reader: Callable[..., Iterable[can.Message]], suffix: str) -> Iterator[can.Message]:
+    def _binary(self, reader: Callable[..., Iterable[can.Message]]) -> Iterator[can.Message]:
         """Frames of a binary file, up to where it is damaged."""
         try:
-            yield from reader(self.path if suffix == ".mf4" else self._file)
+            yield from reader(self.path)
         except NotImplementedError:
             raise LogError(f"{self.path}: MF4 needs a package more: pip install 'tractor-ucs[mf4]'") from None
         except (EOFError, OSError, zlib.error):

@@ -1,0 +1,97 @@
+"""What the readers of blocks have in common: rows that become a block, and numbers for identifiers."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from level1.block import HEAD_BYTES, Block, Ints, Words
+
+MOST_TALKERS = 32_768
+"""A block ends before it has many more talkers than that: a babbling node brings a new one with each frame."""
+
+_HASH = np.uint64(0x9E37_79B9_7F4A_7C15)
+_SLOTS = 1 << 16
+_NO_ROWS: Ints = np.zeros(0, np.int64)
+
+
+class Numbers:
+    """Talkers of whatever names them in a recording (an identifier as it is spelled, a channel and an identifier), eight bytes.
+
+    resolve(word): the talker, negative where the word names none. No word is zero.
+    """
+
+    def __init__(self, resolve: Callable[[int], int]):
+        self._resolve = resolve
+        self._texts = np.zeros(_SLOTS, np.uint64)
+        self._talkers = np.zeros(_SLOTS, np.int32)
+        self._others: dict[int, int] = {}
+
+    def of(self, names: Words) -> npt.NDArray[np.int32]:
+        """The talkers of some words."""
+        slots = (names * _HASH >> np.uint64(48)).view(np.int64)
+        talkers = self._talkers.take(slots)
+        unknown = np.flatnonzero(self._texts.take(slots) != names)
+        if len(unknown):
+            words, which = np.unique(names[unknown], return_inverse=True)
+            talkers[unknown] = np.array([self._meet(word) for word in words.tolist()], np.int32)[which]
+        return talkers
+
+    def _meet(self, word: int) -> int:
+        """The talker of an identifier that is not in its slot of the table."""
+        if word not in self._others:
+            self._others[word] = self._resolve(word)
+            slot = word * int(_HASH) % (1 << 64) >> 48
+            if not self._texts[slot]:
+                self._texts[slot], self._talkers[slot] = word, self._others[word]
+        return self._others[word]
+
+
+class Rows:
+    """The rows of a block that is being filled; the same memory for every block, because fresh memory is slow. count: so far."""
+
+    def __init__(self, rows: int):
+        self.count = 0
+        self._t_ns = np.empty(rows, np.int64)
+        self._talker = np.empty(rows, np.uint16)
+        self._length = np.empty(rows, np.uint16)
+        self._head = np.empty(rows, np.uint64)
+        self._wide: list[tuple[Ints, npt.NDArray[np.uint8]]] = []
+
+    def sheet(self, lines: int) -> tuple[Ints, npt.NDArray[np.uint16], npt.NDArray[np.uint16], Words]:
+        """Room for the frames of so many lines: times, talkers, lengths, heads."""
+        part = slice(self.count, self.count + lines)
+        if part.stop > len(self._t_ns):
+            for name in ("_t_ns", "_talker", "_length", "_head"):
+                column = getattr(self, name)
+                setattr(self, name, np.concatenate((column[:self.count], np.empty(lines, column.dtype))))
+        return self._t_ns[part], self._talker[part], self._length[part], self._head[part]
+
+    def keep(self, found: npt.NDArray[np.bool_], wide: list[tuple[Ints, npt.NDArray[np.uint8]]]) -> None:
+        """Those lines of the last sheet are frames. wide: lines of frames that are longer than a head, and their payloads."""
+        lines, begin, places = len(found), self.count, np.arange(len(found))
+        self.count += lines
+        if not found.all():
+            kept = int(np.count_nonzero(found))
+            for column in (self._t_ns, self._talker, self._length, self._head):
+                column[begin:begin + kept] = column[begin:begin + lines][found]
+            self.count = begin + kept
+            places = np.cumsum(found) - 1
+        self._wide += [(places[rows] + begin, payloads) for rows, payloads in wide]
+
+    def block(self, keys: list[int]) -> Block:
+        """All rows; they are good until the next sheet is taken."""
+        count, self.count = self.count, 0
+        wide_rows = np.concatenate([_NO_ROWS, *(rows for rows, _ in self._wide)])
+        longest = max((payloads.shape[1] for _, payloads in self._wide), default=0)
+        wide = np.zeros((len(wide_rows), longest + HEAD_BYTES), np.uint8)
+        place = 0
+        for rows, payloads in self._wide:
+            wide[place:place + len(rows), :payloads.shape[1]] = payloads
+            place += len(rows)
+        order = np.argsort(wide_rows)
+        self._wide = []
+        block = Block(self._t_ns[:count], self._talker[:count], keys, self._length[:count], self._head[:count], wide_rows[order],
+                      wide[order])
+        return block
