@@ -121,6 +121,20 @@ class Log:
                 self.frames_read += len(block)
                 yield block
 
+    def _mf4_blocks(self, rows: int) -> Iterator[Block]:
+        from level1.block import Block
+        from level1.io.mf4 import Unsupported
+        from level1.io.mf4_blocks import Mf4Blocks
+        try:
+            yield from self._counted_blocks(Mf4Blocks(self._file, self.bus, self._skip).blocks(rows))
+        except Unsupported as reason:
+            if self.frames_read:
+                self._skip(f"can't be read any further: {reason}")
+                return
+            frames = self._python_can(".mf4", f"an MF4 with {reason}")
+            while batch := list(itertools.islice(frames, SINGLE_ROWS)):
+                yield Block.of(batch)
+
     @contextmanager
     def _reading(self) -> Iterator[None]:
         with self._raw:
@@ -135,7 +149,7 @@ class Log:
     def _read_blocks(self, rows: int) -> Iterator[Block]:
         from level1.block import Block
         if self._columns is not None:
-            yield from self._counted_blocks(self._columns(rows))
+            yield from self._columns(rows)
             return
         frames = self._read()
         while batch := list(itertools.islice(frames, min(rows, SINGLE_ROWS))):
@@ -153,16 +167,16 @@ class Log:
     def _from_blocks(self) -> Iterator[Frame]:
         """Frame by frame what only a reader of blocks can read."""
         assert self._columns is not None
-        for block in self._counted_blocks(self._columns(SINGLE_ROWS)):
+        for block in self._columns(SINGLE_ROWS):
             yield from block.frames()
 
     def _candump_blocks(self, rows: int) -> Iterator[Block]:
         from level1.io.candump_blocks import CandumpBlocks
-        return CandumpBlocks(self._file, self.bus, self._skip).blocks(rows)
+        return self._counted_blocks(CandumpBlocks(self._file, self.bus, self._skip).blocks(rows))
 
     def _blf_blocks(self, rows: int) -> Iterator[Block]:
         from level1.io.blf_blocks import BlfBlocks
-        return BlfBlocks(self._file, self.bus, self._skip).blocks(rows)
+        return self._counted_blocks(BlfBlocks(self._file, self.bus, self._skip).blocks(rows))
 
     def batches(self, size: int = 4096) -> Iterator[list[Frame]]:
         """The frames in lists of at most `size`."""
@@ -193,6 +207,9 @@ class Log:
             return self._gvret
         if suffix == ".blf" or head.startswith(b"LOGG"):
             self._columns = self._blf_blocks
+            return self._from_blocks
+        if suffix == ".mf4" or head.startswith((b"MDF     4", b"UnFinMF 4")):
+            self._columns = self._mf4_blocks
             return self._from_blocks
         if suffix:
             return lambda: self._python_can(suffix)
@@ -255,14 +272,14 @@ class Log:
             except (ValueError, IndexError) as error:
                 self._skip(f"unreadable line {number}: {error}")
 
-    def _python_can(self, suffix: str) -> Iterator[Frame]:
-        """Any other format, through python-can's reader of that suffix."""
+    def _python_can(self, suffix: str, what: str = "") -> Iterator[Frame]:
+        """Any other format, through python-can's reader of that suffix. what: why asammdf is needed for it."""
         from can.io.player import MESSAGE_READERS
         reader = MESSAGE_READERS[suffix]
         first_channel = 1 if suffix == ".asc" else 0  # python-can counts these from 0, the files from 1
         with _warnings_as(lambda text: self._skip(f"unreadable: {text}")):
             if suffix == ".mf4":
-                messages = self._binary(reader)
+                messages = self._binary(reader, what)
             else:
                 messages = self._text(reader, suffix)
             for message in messages:
@@ -275,12 +292,12 @@ class Log:
                     continue
                 yield self._counted(t_ns, key | self.bus(name) << BUS_SHIFT, data)
 
-    def _binary(self, reader: Callable[..., Iterable[can.Message]]) -> Iterator[can.Message]:
+    def _binary(self, reader: Callable[..., Iterable[can.Message]], what: str) -> Iterator[can.Message]:
         """Frames of a binary file, up to where it is damaged."""
         try:
             yield from reader(self.path)
         except NotImplementedError:
-            raise LogError(f"{self.path}: MF4 needs a package more: pip install 'tractor-ucs[mf4]'") from None
+            raise LogError(f"{self.path}: {what} needs a package more: pip install 'tractor-ucs[mf4]'") from None
         except (EOFError, OSError, zlib.error):
             raise
         except Exception as error:  # whatever bytes make python-can's and asammdf's parsers raise
