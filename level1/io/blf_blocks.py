@@ -20,7 +20,7 @@ import numpy.typing as npt
 from level1.block import HEAD_BYTES, Block, Ints
 from level1.frame import BUS_SHIFT, ERROR, EXTENDED, REMOTE
 from level1.io.message import CLASSIC_BYTES, FD_BYTES
-from level1.io.rows import MOST_TALKERS, Numbers, Rows
+from level1.io.rows import HEAD_MASKS, MOST_TALKERS, Numbers, Rows
 
 SIGNATURE = b"LOGG"
 MESSAGE, CONTAINER, ERROR_FRAME, MESSAGE_2, FD_MESSAGE, FD_MESSAGE_64 = 1, 10, 73, 86, 100, 101
@@ -260,8 +260,6 @@ _OBJECT_HEAD = np.dtype([("mark", "<u4"), ("header", "<u2"), ("version", "<u2"),
                          ("", "V4"), ("stamp", "<u8"), ("body", _CLASSIC)])
 _READ = np.isin(np.arange(128), (MESSAGE, MESSAGE_2, FD_MESSAGE, FD_MESSAGE_64, ERROR_FRAME))
 """Which types of objects are read."""
-_HEAD_MASKS = np.array([(1 << 8 * size) - 1 for size in range(HEAD_BYTES + 1)], np.uint64)
-"""What of a head counts, by the size of the payload."""
 
 
 def _is_whole(data: bytes, place: int) -> bool:
@@ -313,7 +311,7 @@ class Objects:
         keys = plain | extended * np.uint64(EXTENDED) | flags
         self.words[places] = keys | channels.astype(np.uint64) << np.uint64(32) | _WORD
         self._sizes[places] = sizes
-        self._heads[places] = heads & _HEAD_MASKS[np.minimum(sizes, HEAD_BYTES)]
+        self._heads[places] = heads & HEAD_MASKS[np.minimum(sizes, HEAD_BYTES)]
 
     def _read_classic(self, places: Ints) -> None:
         if self._is_newer.any():

@@ -14,6 +14,7 @@ from level1.frame import BUS_SHIFT, ERROR, EXTENDED, REMOTE
 from level1.io.merged_blocks import merged
 from level1.io.message import CLASSIC_BYTES, FD_BYTES
 from level1.io.mf4 import Field, Group, Mf4File, Records, Unsupported
+from level1.io.rows import HEAD_MASKS, block_of_words, on_buses
 
 LAG_NS = 1_000_000_000
 """Groups of one list of records may be out of order among each other by so much: their frames are put in order of time."""
@@ -23,11 +24,8 @@ _ROOM = 80
 """Bytes that may be looked at behind the last of a piece."""
 _SIZES_OF_DLC = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
 _LATEST_US = (1 << 33) * 10**6
-_KEY = (1 << BUS_SHIFT) - 1
 NO_CHANNEL = (1 << 16) - 1
 """Stands for the channel of frames that name none."""
-_HEAD_MASKS = np.array([(1 << 8 * size) - 1 for size in range(HEAD_BYTES + 1)], np.uint64)
-"""What of a head counts, by the size of the payload."""
 _ID = np.uint64(0x1FFF_FFFF)
 _NO_ROWS: Ints = np.zeros(0, np.int64)
 
@@ -48,7 +46,6 @@ class Mf4Blocks:
         self._file = file
         self._bus = bus
         self._skip = skip
-        self._buses: dict[int, int] = {}
 
     def blocks(self, rows: int) -> Iterator[Block]:
         """The frames in the order of time, some ten thousand a block or `rows`, whichever is less, or somewhat more.
@@ -64,14 +61,8 @@ class Mf4Blocks:
         recording = Mf4File(self._file)
         streams = [(_Mixed if records.number_size else _Alone)(recording, records, self._skip).blocks(rows)
                    for records in recording.records()]
-        for block in streams[0] if len(streams) == 1 else (block for block, _ in merged(streams, _nothing)):
-            first = block.first_rows().tolist()
-            for place in sorted(range(len(block.keys)), key=first.__getitem__):
-                channel = block.keys[place] >> BUS_SHIFT
-                if channel not in self._buses:
-                    self._buses[channel] = self._bus(str(channel) if channel != NO_CHANNEL else "")
-            block.keys = [key & _KEY | self._buses[key >> BUS_SHIFT] << BUS_SHIFT for key in block.keys]
-            yield block
+        blocks = streams[0] if len(streams) == 1 else (block for block, _ in merged(streams, _nothing))
+        yield from on_buses(blocks, lambda channel: self._bus(str(channel) if channel != NO_CHANNEL else ""))
 
 
 def _nothing() -> None:
@@ -93,10 +84,8 @@ class Frames(NamedTuple):
 
     def block(self) -> Block:
         """These frames as a block whose buses are channels."""
-        words, talkers = np.unique(self.words, return_inverse=True)
         wide_rows = np.flatnonzero(self.wide_of >= 0)
-        return Block(self.t_us * 1000, talkers.astype(np.uint32), words.tolist(), self.lengths, self.heads, wide_rows,
-                     self.wide[self.wide_of[wide_rows]])
+        return block_of_words(self.t_us * 1000, self.words, self.lengths, self.heads, wide_rows, self.wide[self.wide_of[wide_rows]])
 
     def chosen(self, places: Any) -> Frames:
         """Some of them, in this order."""
@@ -235,7 +224,7 @@ class Reader:
         if payloads is None:
             return np.zeros(len(lengths), np.uint64), np.full(len(lengths), -1), np.zeros((0, FD_BYTES + HEAD_BYTES), np.uint8)
         heads = payloads.bytes_of(np.arange(len(lengths)), HEAD_BYTES).view("<u8")[:, 0]
-        heads = heads & _HEAD_MASKS[np.minimum(lengths, HEAD_BYTES)]
+        heads = heads & HEAD_MASKS[np.minimum(lengths, HEAD_BYTES)]
         rows = np.flatnonzero(lengths > HEAD_BYTES)
         wide = np.zeros((len(rows), FD_BYTES + HEAD_BYTES), np.uint8)
         wide[:, :FD_BYTES] = payloads.bytes_of(rows, FD_BYTES)

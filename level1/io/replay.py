@@ -1,8 +1,9 @@
 """Recordings: their frames with exact integer time stamps, whatever the format.
 
 candump text (the log form of `candump -l`/`-L` and the screen form with time stamps) and SavvyCAN's GVRET text are read
-here, because their decimal stamps must become exactly as many nanoseconds; every other format goes through python-can's
-readers, whose floating-point stamps are rounded to the microsecond (all they hold at today's epoch).
+here, because their decimal stamps must become exactly as many nanoseconds; BLF, MF4 and pcap by readers of their own
+(`blf_blocks`, `mf4_blocks`, `pcap_blocks`), which read many frames at a time. ASC and TRC go through python-can's readers,
+whose floating-point stamps are rounded to the microsecond (all they hold at today's epoch).
 
 Nothing in a file stops the reading for good: a line that can't be read is skipped, counted and told. Stamps that run
 backwards are handed on as they stand; the supervisor clamps and counts them.
@@ -47,7 +48,8 @@ EPOCH_NS = 1_000_000_000 * 10**9
 _ASC_FRAME = re.compile(r"\s*\d+\.\d+\s")
 _GVRET_HEAD = re.compile(rb"Time Stamp,ID,Extended,(Dir,)?Bus,LEN\b")
 _SUFFIXES = (".asc", ".blf", ".csv", ".mf4", ".trc")
-_HINT = "known: candump text, .asc, .blf, .csv, .mf4, .trc, also with .gz"
+_PCAP = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\x0a\x0d\x0d\x0a")
+_HINT = "known: candump text, .asc, .blf, .csv, .mf4, .pcap, .trc, also with .gz"
 
 
 class LogError(OutsideError):
@@ -120,6 +122,10 @@ class Log:
                 self.last_ns = max(self.last_ns, int(block.t_ns.max()))
                 self.frames_read += len(block)
                 yield block
+
+    def _pcap_blocks(self, rows: int) -> Iterator[Block]:
+        from level1.io.pcap_blocks import PcapBlocks
+        return self._counted_blocks(PcapBlocks(self._file, self.bus, self._skip).blocks(rows))
 
     def _mf4_blocks(self, rows: int) -> Iterator[Block]:
         from level1.block import Block
@@ -207,6 +213,9 @@ class Log:
             return self._gvret
         if suffix == ".blf" or head.startswith(b"LOGG"):
             self._columns = self._blf_blocks
+            return self._from_blocks
+        if head.startswith(_PCAP):
+            self._columns = self._pcap_blocks
             return self._from_blocks
         if suffix == ".mf4" or head.startswith((b"MDF     4", b"UnFinMF 4")):
             self._columns = self._mf4_blocks

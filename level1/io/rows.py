@@ -1,12 +1,14 @@
 """What the readers of blocks have in common: rows that become a block, and numbers for identifiers."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from level1.block import HEAD_BYTES, Block, Ints, Words
+from level1.frame import BUS_SHIFT
 
 MOST_TALKERS = 32_768
 """A block ends before it has many more talkers than that: a babbling node brings a new one with each frame."""
@@ -95,3 +97,26 @@ class Rows:
         block = Block(self._t_ns[:count], self._talker[:count], keys, self._length[:count], self._head[:count], wide_rows[order],
                       wide[order])
         return block
+
+
+HEAD_MASKS = np.array([(1 << 8 * size) - 1 for size in range(HEAD_BYTES + 1)], np.uint64)
+"""What of a head counts, by the size of the payload up to eight."""
+
+
+def block_of_words(t_ns: Ints, words: Words, lengths: Any, heads: Words, wide_rows: Ints, wide: npt.NDArray[np.uint8]) -> Block:
+    """A block of frames whose talkers are named by words: `Frame.key` with the number of a channel in place of the bus."""
+    keys, talkers = np.unique(words, return_inverse=True)
+    return Block(t_ns, talkers.astype(np.uint32), keys.tolist(), lengths, heads, wide_rows, wide)
+
+
+def on_buses(blocks: Iterator[Block], bus_of: Callable[[int], int]) -> Iterator[Block]:
+    """Blocks with buses for channels. bus_of(channel): asked once for each, in the order in which they appear."""
+    buses: dict[int, int] = {}
+    for block in blocks:
+        first = block.first_rows().tolist()
+        for place in sorted(range(len(block.keys)), key=first.__getitem__):
+            channel = block.keys[place] >> BUS_SHIFT
+            if channel not in buses:
+                buses[channel] = bus_of(channel)
+        block.keys = [key & (1 << BUS_SHIFT) - 1 | buses[key >> BUS_SHIFT] << BUS_SHIFT for key in block.keys]
+        yield block
