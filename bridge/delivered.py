@@ -80,10 +80,7 @@ class Delivered:
             return _prepared(sqlite3.connect(":memory:", isolation_level=None))
 
     def _load(self) -> dict[int, Ranges]:
-        ranges: dict[int, Ranges] = {}
-        for boot, first, last in self._connection.execute("SELECT boot, first, last FROM delivered ORDER BY boot, first"):
-            ranges.setdefault(boot, Ranges()).add(first, last)
-        return ranges
+        return _ranges(self._connection)
 
 
 def delivered_path(journal: Path) -> Path:
@@ -93,17 +90,29 @@ def delivered_path(journal: Path) -> Path:
 
 def delivered_upto(path: Path) -> dict[int, int]:
     """What `Delivered.upto` gives, for another process; empty where there is no bridge yet."""
+    return {boot: upto for boot, ranges in delivered_ranges(path).items() if (upto := ranges.upto)}
+
+
+def delivered_ranges(path: Path) -> dict[int, Ranges]:
+    """Boot -> acknowledged seqs, for another process; empty where there is no bridge yet."""
     try:
         connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
     except sqlite3.Error:
         return {}
     try:
-        rows = connection.execute("SELECT boot, last FROM delivered WHERE first = 1").fetchall()
-        return {int(boot): int(last) for boot, last in rows}
+        return _ranges(connection)
     except (sqlite3.Error, TypeError, ValueError):
         return {}
     finally:
         connection.close()
+
+
+def _ranges(connection: sqlite3.Connection) -> dict[int, Ranges]:
+    """All that it holds. Raises sqlite3.Error; TypeError and ValueError for what is no number."""
+    ranges: dict[int, Ranges] = {}
+    for boot, first, last in connection.execute("SELECT boot, first, last FROM delivered ORDER BY boot, first"):
+        ranges.setdefault(int(boot), Ranges()).add(int(first), int(last))
+    return ranges
 
 
 def _connect(path: Path) -> sqlite3.Connection:

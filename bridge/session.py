@@ -75,9 +75,11 @@ class Bridge:
     """The bridge of one journal. Raises OutsideError where another bridge serves it.
 
     say: called with a line about what happens, each kind of trouble once. counters: of what came and what was wrong with it.
+    turned: called after every turn of the loop, at least once a minute.
     """
 
-    def __init__(self, settings: Settings, say: Callable[[str], None], clock: Clock | None = None):
+    def __init__(self, settings: Settings, say: Callable[[str], None], clock: Clock | None = None, *,
+                 turned: Callable[[], None] = lambda: None):
         try:
             wire.check_name(settings.unit, "unit")
             wire.check_name(settings.fleet, "fleet")
@@ -85,7 +87,7 @@ class Bridge:
             raise OutsideError(str(error)) from None
         self.settings = settings
         self.counters: Counter[str] = Counter()
-        self._say = say
+        self._say, self._turned = say, turned
         self._clock = clock or Clock()
         self._jitter = random.Random()
         self._said: set[str] = set()
@@ -119,6 +121,7 @@ class Bridge:
         try:
             while not self._stopping:
                 self._turn()
+                self._turned()
         finally:
             self._close()
 

@@ -179,6 +179,17 @@ class RepairMachine:
             self.holds.claim(self, t_ns, self.messages)
             self.fail(t_ns, "the supervisor was restarted during the attempt")
 
+    def obstacle(self) -> str:
+        """Why no attempt begins although one is due; empty while nothing is in the way."""
+        if self.phase != WAITING:
+            return ""
+        if why := self.host.forbidden(self.definition):
+            return why
+        if self.feedback():
+            return "its feedback is missing or wrong"
+        owners = {owner.name for message in self.messages if (owner := self.holds.owner(message)) and owner is not self}
+        return f"{', '.join(sorted(owners))} needs its command message" if owners else ""
+
     # --- what it does -----------------------------------------------------------------------------------------------------
 
     def consider(self, t_ns: int) -> None:

@@ -223,6 +223,12 @@ class Supervisor:
         if machine.state == NORMAL and not present:
             machines.pop(key, None)
 
+    def active(self) -> Iterator[tuple[AlarmMachine, RepairMachine | None]]:
+        """Every alarm, and every reported cause of one, that is not normal, with its repair where it has one; to be looked at."""
+        for machine in self._machines():
+            if machine.state != NORMAL:
+                yield machine, None if machine.key else self._repairs.get(machine.definition.name)
+
     def causes(self, alarm: str) -> dict[str, dict[str, Any]]:
         """The causes of an alarm that are reported as being there, by key, with their details."""
         return {key: machine.detail for key, machine in self._reported.get(alarm, {}).items()}

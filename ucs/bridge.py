@@ -2,13 +2,21 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import socket
 import sys
+import time
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from level1.io.config import Config, ConfigError, load
+from level1.io.inquiry import Desk
+from level1.io.systemd import Supervised
+from ucs.standing import BRIDGE, BridgeStanding, encode
+from ucs.version import version
 
 if TYPE_CHECKING:
     from bridge.session import Settings
@@ -52,11 +60,54 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError("ucs bridge: give the path of a unit.toml")
     from bridge.session import Bridge
     settings = settings_of(load(args.unit))
-    bridge = Bridge(settings, lambda line: print(f"ucs bridge: {line}", file=sys.stderr, flush=True))
+    service = Supervised()
+    witness = Witness(str(settings.broker), time.monotonic_ns, service)
+    bridge = Bridge(settings, witness.say, turned=lambda: witness.turned(bridge.online, bridge.counters))
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: bridge.stop())
-    bridge.run()
+    with Desk(settings.journal, BRIDGE, lambda: encode(witness.standing())):
+        service.ready(f"carrying {settings.unit} to {settings.broker}")
+        bridge.run()
+        service.stopping()
     return 0
+
+
+class Witness:
+    """What a bridge has said and done lately, for those who ask. Told by the bridge's thread, asked by another."""
+
+    def __init__(self, broker: str, clock: Callable[[], int], service: Supervised):
+        self._broker, self._clock, self._service = broker, clock, service
+        self._begun_ns = self._turned_ns = self._changed_ns = clock()
+        self._ack_ns: int | None = None
+        self._online = False
+        self._counters: Counter[str] = Counter()
+        self._said = ""
+
+    def say(self, line: str) -> None:
+        """A line about what happens."""
+        self._said = line
+        print(f"ucs bridge: {line}", file=sys.stderr, flush=True)
+
+    def turned(self, online: bool, counters: Counter[str]) -> None:
+        """The bridge has done a turn."""
+        now_ns = self._turned_ns = self._clock()
+        if counters["ack"] != self._counters["ack"]:
+            self._ack_ns = now_ns
+        if online != self._online:
+            self._online, self._changed_ns = online, now_ns
+        self._counters = Counter(counters)
+        self._service.alive(now_ns)
+
+    def standing(self) -> BridgeStanding:
+        """How the bridge stands."""
+        now_ns = self._clock()
+
+        def age_s(then_ns: int) -> float:
+            return max(0.0, (now_ns - then_ns) / 1e9)
+        return BridgeStanding(
+            broker=self._broker, version=version(), pid=os.getpid(), uptime_s=age_s(self._begun_ns),
+            turn_age_s=age_s(self._turned_ns), online=self._online, online_s=age_s(self._changed_ns),
+            ack_age_s=None if self._ack_ns is None else age_s(self._ack_ns), said=self._said, counters=dict(self._counters))
 
 
 def _make_site(args: argparse.Namespace) -> int:

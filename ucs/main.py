@@ -23,28 +23,42 @@ class Command(NamedTuple):
     help: str
 
 
-COMMANDS = {
-    "demo": Command("ucs.demo", "a simulated tractor loses its pilot flame, told as it happens"),
-    "check": Command("ucs.check", "check alarm definitions in DBC files"),
-    "alarms": Command("ucs.check", "list the alarms that DBC files define"),
-    "new": Command("ucs.new", "write a DBC file to start your own alarms from"),
-    "run": Command("ucs.run", "supervise a unit live"),
-    "replay": Command("ucs.replay", "run alarm definitions over recordings"),
-    "diff": Command("ucs.diff", "compare the alarms of two sets of definitions over recordings"),
-    "simulate": Command("ucs.simulate", "simulate the nodes on the bus, with faults as a scenario says"),
-    "bridge": Command("ucs.bridge", "carry a unit's events to level 2 and commands back"),
-    "level2": Command("ucs.level2", "receive, store and acknowledge what units send"),
-    "keys": Command("ucs.keys", "make and list the keys of those who may command"),
-    "journal": Command("ucs.journal", "list and export what a unit's journal holds"),
+GROUPS = {
+    "to see what it is": {
+        "demo": Command("ucs.demo", "a simulated tractor loses its pilot flame, told as it happens"),
+        "simulate": Command("ucs.simulate", "simulate the nodes on the bus, with faults as a scenario says"),
+    },
+    "to define alarms": {
+        "new": Command("ucs.new", "write a DBC file to start your own alarms from"),
+        "check": Command("ucs.check", "check alarm definitions in DBC files"),
+        "alarms": Command("ucs.check", "list the alarms that DBC files define, or write a handbook of them"),
+    },
+    "to try them on recordings": {
+        "replay": Command("ucs.replay", "run alarm definitions over recordings"),
+        "diff": Command("ucs.diff", "compare the alarms of two sets of definitions over recordings"),
+    },
+    "on the tractor": {
+        "run": Command("ucs.run", "supervise a unit live"),
+        "status": Command("ucs.status", "how a unit is, once: for people and monitoring systems"),
+        "journal": Command("ucs.journal", "list, follow and export what happened"),
+        "bridge": Command("ucs.bridge", "carry a unit's events to level 2 and commands back"),
+    },
+    "above the tractor": {
+        "level2": Command("ucs.level2", "receive, store and acknowledge what units send"),
+        "keys": Command("ucs.keys", "make and list the keys of those who may command"),
+    },
 }
+COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that tells a mistake in one line."""
+    """A parser that tells a mistake in one line. mistake: the exit code of one."""
+
+    mistake = 2
 
     def error(self, message: str) -> NoReturn:
         print(f"ucs: {message} (see {self.prog} --help)", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(self.mistake)
 
 
 class _Version(argparse.Action):
@@ -54,12 +68,8 @@ class _Version(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help="print the version and exit")
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        from importlib.metadata import PackageNotFoundError, version
-        try:
-            found = version("tractor-ucs")
-        except PackageNotFoundError:
-            found = "of a source folder that is not installed"
-        print(f"ucs {found}")
+        from ucs.version import version
+        print(f"ucs {version() or 'of a source folder that is not installed'}")
         parser.exit()
 
 
@@ -67,16 +77,24 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
     """The command line, with the arguments of the chosen subcommand; the others stand there by name and help only."""
     parser = _Parser(
         prog="ucs", description="Supervision of a tractor and its implements: alarms, repairs, and the way to level 2.",
-        epilog="`ucs COMMAND --help` tells more about a command; `ucs demo` shows it all.")
+        epilog=_listing(), formatter_class=argparse.RawDescriptionHelpFormatter, usage="ucs [--help] [--version] COMMAND ...")
     parser.add_argument("--version", action=_Version)
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, prog="ucs", help=argparse.SUPPRESS)
     loaded = COMMANDS[chosen].module if chosen else None
     for name, command in COMMANDS.items():
         if name == chosen:
             importlib.import_module(command.module).add_parser(commands)
         elif command.module != loaded:
-            commands.add_parser(name, help=command.help, add_help=False)
+            commands.add_parser(name, add_help=False)
     return parser
+
+
+def _listing() -> str:
+    """The commands by what they are for."""
+    lines = []
+    for purpose, group in GROUPS.items():
+        lines += [purpose + ":", *(f"  {name:<10} {command.help}" for name, command in group.items()), ""]
+    return "\n".join([*lines, "`ucs COMMAND --help` tells more about a command; `ucs demo` shows it all."])
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from decimal import Decimal
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import Any, TextIO
 
 from level1.event import Event
@@ -60,6 +60,18 @@ def detail(event: Event) -> str:
     if event.event == "repaired":
         return f"by attempt {event.attempt}"
     return event.text if event.event in ("locked_out", "acknowledged") else ""
+
+
+def roughly(seconds: float) -> str:
+    """A length of time, two units at most: "0.4 s", "3 h 12 min"."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    for (unit, size), (smaller, part) in pairwise((("d", 86400), ("h", 3600), ("min", 60), ("s", 1))):
+        if whole >= size:
+            rest = whole % size // part
+            return f"{whole // size} {unit} {rest} {smaller}" if rest else f"{whole // size} {unit}"
+    return f"{whole} s"
 
 
 def values_text(values: Mapping[str, Any]) -> str:

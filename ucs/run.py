@@ -23,9 +23,11 @@ from level1.io.error import OutsideError
 from level1.io.inbox import Inbox
 from level1.io.journal import Journal
 from level1.io.live import Live, decode_state
+from level1.io.systemd import Supervised
 from level1.memory import State
 from level1.supervisor import Supervisor
 from ucs import readings
+from ucs.attendant import Attendant
 from ucs.printer import Printer
 from ucs.render import clock, event_line, painted, wants_colour
 from ucs.uplink import Uplink
@@ -66,16 +68,21 @@ def run(args: Namespace) -> int:
         journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name, new_boot=_first_boot()))
         uplink = stack.enter_context(Uplink(journal, inbox, time.monotonic_ns))
         sources = readings.start(settings, catalog, ports, journal, inbox, stack)
+        service = Supervised()
+        attendant = Attendant(uplink, sources.house, time.monotonic_ns, service)
         histories = HistoryReader(settings.bus, inbox.notice)
         stack.callback(histories.stop)
         live = Live(_supervisor(settings, catalog, journal, own, known), journal, ports, inbox, clock=time.monotonic_ns,
                     wall=time.time_ns, told=_teller(printer, histories), notice=lambda text: printer.err(f"ucs: {text}"),
-                    link=uplink, house=sources.house, gnss=sources.gnss, recorder=sources.recorder, quiet=readings.quiet(settings))
+                    link=attendant, house=attendant, gnss=sources.gnss, recorder=sources.recorder, quiet=readings.quiet(settings))
+        stack.enter_context(attendant.attend(live, journal, sources, settings.unit.fleet))
         stack.callback(lambda: printer.out("\n".join(_end_lines(live, ports, sources))))
         with _ended_by_signals(live):
             printer.out("\n".join(_start_lines(settings, catalog)))
             printer.out(f"boot {journal.boot}, journal {settings.journal.path}; supervising")
+            service.ready(f"supervising {settings.unit.name}, boot {journal.boot}")
             live.run()
+            service.stopping()
     return 0
 
 

@@ -84,7 +84,7 @@ Opener = Callable[[Bus, Callable[[], int], Callable[[], int]], Interface]
 
 
 class Port:
-    """One bus. counters: frames sent, expired, dropped and failed; times lost; frames lost on the way in.
+    """One bus. counters: frames sent, expired, dropped and failed; times lost; frames lost on the way in. received: frames so far.
 
     clock, wall: monotonic and wall clock in ns. opener: opens the interface (default: `open_bus`).
     """
@@ -95,6 +95,7 @@ class Port:
         self.counters: Counter[str] = Counter()
         self.health = BusHealth(settings.name, settings.channel, settings.bitrate)
         self.load_percent: float | None = None
+        self.received = 0
         self._inbox, self._clock, self._wall = inbox, clock, wall
         self._opener = opener or open_bus
         self._wire: Interface | None = None
@@ -113,6 +114,12 @@ class Port:
     def is_lost(self) -> bool:
         """Whether the interface is gone at the moment."""
         return self._lost_ns is not None
+
+    @property
+    def last_ns(self) -> int | None:
+        """When the last frame came; None: none since the interface was opened."""
+        wire = self._wire
+        return None if wire is None else wire.last_ns
 
     @property
     def state(self) -> str:
@@ -196,6 +203,7 @@ class Port:
                 self._suspect = reason(error)
                 return []
             self._window.count(frames)
+            self.received += len(frames)
             return frames
 
     # --- the bus's thread ---------------------------------------------------------------------------------------------
@@ -219,6 +227,7 @@ class Port:
         if wire.fileno() is None:
             frames = wire.receive(self.index)
             self._window.count(frames)
+            self.received += len(frames)
         else:
             self._stopping.wait(TICK_S)
             late = self._clock() - self._fetched_ns > LATE_NS

@@ -60,6 +60,17 @@ class Reader:
         rows = self._rows("SELECT boot, seq FROM event ORDER BY boot DESC, seq DESC LIMIT 1")
         return (rows[0][0], rows[0][1]) if rows else FIRST
 
+    def latest(self, alarm: str, event: str) -> Event | None:
+        """The newest event of a kind of an alarm."""
+        query = "SELECT line FROM event WHERE alarm = ? AND event = ? ORDER BY boot DESC, seq DESC LIMIT 1"
+        rows = self._rows(query, (alarm, event))
+        return self._decoded(rows[0][0]) if rows else None
+
+    def state(self) -> bytes | None:
+        """The supervisor's state as last written."""
+        rows = self._rows("SELECT snapshot FROM state")
+        return rows[0][0] if rows else None
+
     def boots(self) -> tuple[int, ...]:
         """Every boot id, in order."""
         rows = self._rows("SELECT boot FROM boot UNION SELECT DISTINCT boot FROM event ORDER BY boot")
