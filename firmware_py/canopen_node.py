@@ -157,6 +157,10 @@ class CanopenNode(Node):
         if self.nmt_state == OPERATIONAL or (can_id, extended) in self._own:
             super().receive(t_ns, can_id, extended, data)
 
+    def hears(self, can_id: int, extended: bool) -> bool:
+        """Every frame of CANopen: the package decides."""
+        return not extended or super().hears(can_id, extended)
+
     def step(self, now_ns: int) -> list[BusFrame]:
         """All ticks up to now, and the frames that are due."""
         super().step(now_ns)

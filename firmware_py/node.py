@@ -56,6 +56,8 @@ class Node:
         self._next_tick_ns = start_ns
         self._boots_ns: int | None = None
         self._due_ns = dict.fromkeys(self.SENDS, start_ns)
+        self._first_due_ns = start_ns
+        self._identifiers = {message: codec.identifier(message) for message in self.SENDS}
         self._cycles_ns = {message: codec.cycle_ns(message) for message in self.SENDS}
         self._sent: dict[str, BusFrame] = {}
         self._heard = {codec.identifier(message): message for message in self.HEARS}
@@ -81,6 +83,10 @@ class Node:
         else:
             self.hear(t_ns, message, values)
 
+    def hears(self, can_id: int, extended: bool) -> bool:
+        """Messages of `HEARS`; and its own, which nobody else should send."""
+        return (can_id, extended) in self._heard or (can_id, extended) in self._own
+
     def step(self, now_ns: int) -> list[BusFrame]:
         """All ticks up to now, and the frames that are due."""
         due: dict[str, None] = {}
@@ -90,11 +96,22 @@ class Node:
             if self._boots_ns is not None and t_ns >= self._boots_ns:
                 self._boot(t_ns)
             self.tick(t_ns)
-            for message, due_ns in self._due_ns.items():
-                if t_ns >= due_ns:
-                    self._due_ns[message] = due_ns + self._cycles_ns[message]
-                    due[message] = None
-        return [frame for message in due if (frame := self._frame(message)) is not None] if due else []
+            if t_ns >= self._first_due_ns:
+                self._fall_due(t_ns, due)
+        if not due:
+            return []
+        return [frame for message in due if (frame := self._frame(message)) is not None]
+
+    def _fall_due(self, t_ns: int, due: dict[str, None]) -> None:
+        """Note the messages whose time has come."""
+        first_ns = t_ns + max(self._cycles_ns.values(), default=0)
+        for message, due_ns in self._due_ns.items():
+            if t_ns >= due_ns:
+                due_ns = self._due_ns[message] = due_ns + self._cycles_ns[message]
+                due[message] = None
+            if due_ns < first_ns:
+                first_ns = due_ns
+        self._first_due_ns = first_ns
 
     def next_deadline(self) -> int | None:
         """The next tick."""
@@ -150,7 +167,8 @@ class Node:
         values = self.values(message)
         if values is None:
             return None
-        frame = BusFrame(*self.codec.identifier(message), self.codec.encode(message, values))
+        can_id, extended = self._identifiers[message]
+        frame = BusFrame(can_id, extended, self.codec.encode(message, values))
         self._sent[message] = frame
         return frame
 

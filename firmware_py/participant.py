@@ -42,3 +42,18 @@ class Storyteller(Protocol):
 
     def take_happenings(self) -> list[Happening]:
         """What happened since the last call, in order."""
+
+
+@runtime_checkable
+class Selective(Protocol):
+    """A participant that does nothing about most frames: it need not be told of those that it doesn't hear."""
+
+    def hears(self, can_id: int, extended: bool) -> bool:
+        """Whether `receive` does anything about frames of this identifier; always the same answer."""
+
+
+@runtime_checkable
+class Meddler(Protocol):
+    """A participant whose `step` does something to others, so that their deadlines may move."""
+
+    meddles: bool

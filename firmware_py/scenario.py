@@ -107,6 +107,8 @@ class Scenario:
 class Director:
     """Makes a scenario's steps happen to its nodes. A participant that neither hears nor sends; it comes first in the line."""
 
+    meddles = True
+
     def __init__(self, steps: Iterable[Step], nodes: Mapping[str, Node]):
         self._steps = [step for step in steps if step.node in nodes]
         self._nodes = nodes
@@ -114,6 +116,10 @@ class Director:
 
     def receive(self, t_ns: int, can_id: int, extended: bool, data: bytes) -> None:
         """Nothing reaches it."""
+
+    def hears(self, can_id: int, extended: bool) -> bool:
+        """Nothing."""
+        return False
 
     def step(self, now_ns: int) -> list[BusFrame]:
         """Whatever is due happens."""

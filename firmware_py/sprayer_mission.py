@@ -126,6 +126,10 @@ class SprayerMission(Node):
         """Hear a frame; 29-bit ones from any source."""
         super().receive(t_ns, can_id & ~0xFF | ANY_SOURCE if extended else can_id, extended, data)
 
+    def hears(self, can_id: int, extended: bool) -> bool:
+        """29-bit identifiers from any source."""
+        return super().hears(can_id & ~0xFF | ANY_SOURCE if extended else can_id, extended)
+
     def hear(self, t_ns: int, message: str, values: Mapping[str, Value]) -> None:
         """Status, alarms, or where the tractor is."""
         match message:

@@ -122,8 +122,8 @@ class Vehicle(Node):
         super().__init__(name, codec, start_ns=start_ns)
         chosen = {setting.name: setting.default for setting in self.SETTINGS} | dict(settings)
         self._cycles_ns.update({message: cycle_ms * 1_000_000 for message, (_, cycle_ms) in ISOBUS.items()})
-        self._sources = {codec.identifier(message)[0]: source for message, (source, _) in ISOBUS.items()
-                         if codec.identifier(message)[0] & 0xFF == 0xFE}
+        self._identifiers.update({message: (can_id & ~0xFF | source, True) for message, (source, _) in ISOBUS.items()
+                                  if (can_id := codec.identifier(message)[0]) & 0xFF == 0xFE})
         self._dt_s = self.TICK_NS / 1e9
         self._random = random
         self.engine = Engine(self._dt_s, chosen["fuel"])
@@ -314,7 +314,8 @@ class Vehicle(Node):
 
     def step(self, now_ns: int) -> list[BusFrame]:
         """Frames of J1939 carry the source address of their device, and its reserved values where it knows nothing."""
-        return [self._as_sent(frame) for frame in super().step(now_ns)]
+        frames = super().step(now_ns)
+        return [self._as_sent(frame) for frame in frames] if self._unplugged or self.fix == "NoFix" else frames
 
     def _as_sent(self, frame: BusFrame) -> BusFrame:
         can_id, extended, data = frame
@@ -328,8 +329,7 @@ class Vehicle(Node):
             data = NO_VALUE[:4] + data[4:]
         elif pgn == _EFL_PGN and self._unplugged:
             data = data[:OIL_BYTE] + bytes([SENSOR_ERROR]) + data[OIL_BYTE + 1:]
-        source = self._sources.get(can_id)
-        return BusFrame(can_id if source is None else can_id & ~0xFF | source, extended, data)
+        return BusFrame(can_id, extended, data)
 
     def values(self, message: str) -> Mapping[str, Value]:
         """What the sensors say now."""

@@ -189,6 +189,25 @@ def raw_of(signal: Signal, data: bytes) -> RawValue | None:
     return raw
 
 
+def reader(signal: Signal) -> Callable[[bytes], RawValue | None]:
+    """`raw_of` for one signal, worked out beforehand."""
+    if signal.is_float:
+        return lambda data: raw_of(signal, data)
+    need, mask, sign = last_byte(signal), (1 << signal.length) - 1, 1 << signal.length - 1 if signal.signed else 0
+    position, from_bytes = first_bit(signal) + signal.length, int.from_bytes
+
+    def little(data: bytes) -> int | None:
+        if len(data) <= need:
+            return None
+        return ((from_bytes(data, "little") >> signal.start & mask) ^ sign) - sign
+
+    def big(data: bytes) -> int | None:
+        if len(data) <= need:
+            return None
+        return ((from_bytes(data, "big") >> 8 * len(data) - position & mask) ^ sign) - sign
+    return big if signal.big_endian else little
+
+
 def encode(message: Message, values: Mapping[str, int], base: bytes | None = None) -> bytes:
     """Payload of a message with these raw values; all other bits as in `base`, or of the initial values without one.
 

@@ -6,11 +6,12 @@ nothing stale is sent late.
 """
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
 from fractions import Fraction
 
 from level1.catalog import Catalog, Message, Signal
-from level1.decode import raw_of, reserved
+from level1.decode import RawValue, Scale, raw_range, reader, reserved
 
 DEFAULT_LIFE_NS = 100_000_000
 """A frame of a message without cycle time is worthless after this; others after one cycle."""
@@ -18,6 +19,9 @@ BURST = 20
 """Frames of one message within `BURST_NS`: well above any cycle time and the steps of a repair, well below what harms a bus
 (20 frames in 100 ms are about 10 % of a 250 kbit/s bus)."""
 BURST_NS = 100_000_000
+
+
+_Limit = tuple[Signal, Callable[[bytes], RawValue | None], int, int, tuple[tuple[int, int, int], ...]]
 
 
 class Refused(Exception):
@@ -32,6 +36,7 @@ class Gate:
         self.readings = readings
         self.allowed = frozenset(name for name in {*allowed, *readings} if catalog.messages[name].sent_by_ucs)
         self.recent: dict[str, list[int]] = {}
+        self._limits = {name: _limits(catalog.messages[name], name in readings) for name in self.allowed}
 
     def check(self, t_ns: int, name: str, data: bytes) -> int:
         """Let a payload pass and give the time (ns) until which it may be sent. Raises Refused."""
@@ -40,26 +45,28 @@ class Gate:
         message = self.catalog.messages[name]
         if len(data) != message.length:
             raise Refused(f"{name}: {len(data)} bytes instead of {message.length}")
-        self._ranges(message, data, name in self.readings and message.j1939)
+        for signal, read, low, high, free in self._limits[name]:
+            raw = read(data) or 0
+            if not low <= raw <= high and not any(first <= raw <= last for first, last, _ in free):
+                physical = Fraction(signal.factor) * Fraction(raw) + Fraction(signal.offset)
+                raise Refused(f"{name}.{signal.name}: {float(physical):g} is outside {signal.minimum} … {signal.maximum}")
         recent = [sent for sent in self.recent.get(name, ()) if sent > t_ns - BURST_NS]
         if len(recent) >= BURST:
             raise Refused(f"{name}: more than {BURST} frames in {BURST_NS // 1_000_000} ms")
         self.recent[name] = [*recent, t_ns]
         return t_ns + (message.cycle_ns or DEFAULT_LIFE_NS)
 
-    @staticmethod
-    def _ranges(message: Message, data: bytes, may_be_reserved: bool) -> None:
-        for signal in message.signals:
-            if signal.minimum is None and signal.maximum is None or signal.is_float or signal.multiplexer_ids:
-                continue
-            raw = raw_of(signal, data)
-            if may_be_reserved and _is_reserved(signal, raw or 0):
-                continue
-            physical = Fraction(signal.factor) * Fraction(raw or 0) + Fraction(signal.offset)
-            if signal.minimum is not None and physical < Fraction(signal.minimum) or \
-                    signal.maximum is not None and physical > Fraction(signal.maximum):
-                raise Refused(f"{message.name}.{signal.name}: {float(physical):g} is outside {signal.minimum} … {signal.maximum}")
 
-
-def _is_reserved(signal: Signal, raw: int | float) -> bool:
-    return any(low <= raw <= high for low, high, _ in reserved(signal))
+def _limits(message: Message, is_reading: bool) -> list[_Limit]:
+    """What the raw values of a message must be within, and the reserved ones that a reading may have all the same."""
+    found: list[_Limit] = []
+    for signal in message.signals:
+        if signal.minimum is None and signal.maximum is None or signal.is_float or signal.multiplexer_ids:
+            continue
+        scale, (low, high) = Scale(signal), raw_range(signal)
+        ends = [None if limit is None else scale.raw(limit) for limit in (signal.minimum, signal.maximum)]
+        least, most = ends if scale.numerator > 0 else reversed(ends)
+        low = low if least is None else math.ceil(least)
+        high = high if most is None else math.floor(most)
+        found.append((signal, reader(signal), low, high, reserved(signal) if is_reading and message.j1939 else ()))
+    return found

@@ -19,7 +19,7 @@ from level1.canopen import DEVICE_EMERGENCY, DEVICE_SILENT, NMT, Device, Devices
 from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Catalog, Command, Message, Repair
 from level1.command import Order
 from level1.condition import Compiler, Things, Thresholds, Verdict, Zone, walk
-from level1.decode import GOOD, QUALITY_WORDS, encode
+from level1.decode import GOOD, NEVER, QUALITY_WORDS, encode, reader
 from level1.event import PRIORITIES, Event, Monitor, Output, Result, Send, SentFrame, seconds
 from level1.expression import (
     ExpectStep,
@@ -651,6 +651,27 @@ class _Broadcast:
             supervisor.timers.set(self, now_ns + self.message.cycle_ns)
 
 
+class _Sampled:
+    """A signal in a monitoring message. data, value: the payload that was looked at last, and what it said."""
+
+    __slots__ = ("cell", "data", "name", "page", "read", "value")
+
+    def __init__(self, name: str, cell: Cell):
+        self.name = name
+        self.cell = cell
+        self.page = cell.page
+        self.read = reader(cell.signal)
+        self.data: bytes | None = None
+        self.value: Any = None
+
+    def look(self, data: bytes) -> Any:
+        """The value in a payload."""
+        raw = self.read(data)
+        self.data = data
+        self.value = physical(self.cell, raw) if raw is not None else None
+        return self.value
+
+
 class _Sampler:
     """A monitoring message, sampled at a fixed rate without drift. Several messages may form one (`MonitorAs`); a signal name
     that two of them have carries its message there."""
@@ -662,19 +683,23 @@ class _Sampler:
         self.order = supervisor.timers.order()
         self.due = FAR
         counts = Counter(signal.name for message in messages for signal in message.signals)
-        self.cells = [(signal.name if counts[signal.name] == 1 else f"{message.name}.{signal.name}",
-                       supervisor.board.cell(message.name, signal.name)) for message in messages for signal in message.signals]
+        self.parts = [_Sampled(signal.name if counts[signal.name] == 1 else f"{message.name}.{signal.name}",
+                               supervisor.board.cell(message.name, signal.name))
+                      for message in messages for signal in message.signals]
 
     def expire(self, now_ns: int) -> None:
         """Take a sample of all values, each with its age and quality."""
         supervisor = self.supervisor
+        refresh = supervisor.board.refresh
         values: dict[str, Any] = {}
         ages: dict[str, float | None] = {}
         quality: dict[str, str] = {}
-        for name, cell in self.cells:
-            raw, grade = supervisor.board.sample(cell)
-            values[name] = physical(cell, raw) if raw is not None and grade == GOOD else None
-            ages[name] = None if cell.page.level < 0 else (now_ns - cell.page.t_ns) / 1e9
+        for part in self.parts:
+            name, page = part.name, part.page
+            refresh(page)
+            grade = part.cell.quality if page.level >= 0 else NEVER
+            values[name] = None if grade != GOOD else part.value if page.data is part.data else part.look(page.data)
+            ages[name] = None if page.level < 0 else (now_ns - page.t_ns) / 1e9
             quality[name] = QUALITY_WORDS[grade]
         supervisor._out.append(Monitor(supervisor.unit, supervisor.boot, seconds(now_ns), supervisor.utc(now_ns),
                                        supervisor.utc_trusted, self.name, values, ages, quality))

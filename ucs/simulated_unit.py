@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 from firmware_py.participant import BusFrame
 from level1.event import Output, Send
-from level1.frame import EXTENDED, Frame, frame_key
+from level1.frame import EXTENDED, Frame
 from level1.supervisor import Supervisor
 
 
@@ -19,7 +19,9 @@ class SimulatedUnit:
 
     def receive(self, t_ns: int, can_id: int, extended: bool, data: bytes) -> None:
         """A frame for the supervisor."""
-        self._take(self.supervisor.receive(Frame(t_ns, frame_key(can_id, extended), data)))
+        outputs = self.supervisor.receive(Frame(t_ns, can_id | EXTENDED if extended else can_id, data))
+        if outputs:
+            self._take(outputs)
 
     def step(self, now_ns: int) -> list[BusFrame]:
         """Time for the supervisor; gives its frames."""
