@@ -97,7 +97,7 @@ class NoJournal:
     fault: str | None = None
     incidents: tuple[str, ...] = ()
 
-    def append(self, events: object, state: bytes) -> bool:
+    def append(self, events: object, state: bytes, commands: object = ()) -> bool:
         """Nothing is kept."""
         return True
 

@@ -70,8 +70,8 @@ Decision = Passed | Refused | Repeated
 class Gate:
     """Decides on commands for one unit. Raises OutsideError when its file can't be used.
 
-    keys: who may command; may be set anew at any time. now_ns: on the unit's clock. renewed: the file was damaged and begun
-    anew; what was issued before that moment is refused, since its counter may have been used.
+    keys: who may command; may be set anew at any time. now_ns: on the unit's clock. renewed: the file was missing or damaged
+    and begun anew; what was issued before that moment is refused, since its counter may have been used.
     """
 
     def __init__(self, path: Path, fleet: str, unit: str, keys: Mapping[str, Key], now_ns: int):
@@ -80,10 +80,10 @@ class Gate:
         self._path = path
         try:
             self._connection, self.renewed = _opened(path)
+            self._not_before = seconds(self._begun_ns(now_ns))
         except (sqlite3.Error, OSError) as error:
             raise OutsideError(f"commands {path}: can't be used ({error}); make {path.parent} a folder that this user may "
                                "write to") from None
-        self._not_before = seconds(now_ns if self.renewed else 0)
 
     def close(self) -> None:
         """Close the file."""
@@ -113,7 +113,8 @@ class Gate:
             self._use(key, order, digest)
         except sqlite3.Error as error:
             return Refused(f"the unit's disk does not take the counter ({error})", True, key.name, order.id, order.seq)
-        passed = Order(f"{key.fingerprint}-{order.seq}", order.name, order.target, order.value, "above")
+        passed = Order(f"{key.fingerprint}-{order.seq}", order.name, order.target, order.value, "above",
+                       int(order.expires_t.scaleb(9)), key.name, order.id)
         return Passed(passed, order.id, order.seq, key.fingerprint)
 
     def remember(self, passed: Passed, outcome: str, reason: str) -> None:
@@ -121,6 +122,13 @@ class Gate:
         with suppress(sqlite3.Error):
             self._connection.execute("UPDATE answer SET outcome = ?, reason = ? WHERE key = ? AND seq = ?",
                                      (outcome, reason, passed.key, passed.seq))
+
+    def _begun_ns(self, now_ns: int) -> int:
+        """When the file was begun, on the unit's clock; 0 once that clock began anew itself. Raises sqlite3.Error."""
+        if self.renewed:
+            self._connection.execute("INSERT OR REPLACE INTO begun VALUES (1, ?)", (now_ns,))
+        row = self._connection.execute("SELECT t_ns FROM begun").fetchone()
+        return row[0] if row and row[0] <= now_ns else 0
 
     def _signed(self, command: wire.Command, key: Key) -> bool:
         try:
@@ -181,7 +189,8 @@ def commands_path(journal: Path) -> Path:
 def _opened(path: Path) -> tuple[sqlite3.Connection, bool]:
     """The gate's file, and whether it had to be begun anew; a damaged one is kept aside. Raises sqlite3.Error, OSError."""
     try:
-        return _connect(path), False
+        missing = not path.exists() or not path.stat().st_size
+        return _connect(path), missing
     except sqlite3.DatabaseError as error:
         if getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF not in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
             raise
@@ -203,6 +212,7 @@ def _connect(path: Path) -> sqlite3.Connection:
         connection.execute("CREATE TABLE IF NOT EXISTS used (key TEXT PRIMARY KEY, seq INTEGER)")
         connection.execute("CREATE TABLE IF NOT EXISTS answer (number INTEGER PRIMARY KEY, key TEXT, seq INTEGER, digest BLOB, "
                            "outcome TEXT, reason TEXT, UNIQUE (key, seq))")
+        connection.execute("CREATE TABLE IF NOT EXISTS begun (one INTEGER PRIMARY KEY CHECK (one = 1), t_ns INTEGER)")
         connection.execute(f"PRAGMA user_version = {SCHEMA}")
         return connection
     except BaseException:

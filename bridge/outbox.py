@@ -28,8 +28,8 @@ RETRY_LONGEST_NS = 60_000_000_000
 JITTER = 0.25
 BACKLOG_PER_S = 100
 """Backlog events a second: a week's events leave in minutes, and leave room for the fresh ones of a whole fleet."""
-FRESH = 500
-"""With more fresh events than this waiting, they are backlog: the link is poor."""
+FRESH = 100
+"""With more fresh events than this waiting, they are backlog: the link is poor, and the newest must not wait for them."""
 ASKED = 64
 """Ranges asked for again that are remembered."""
 UNJOURNALED = 10_000
@@ -77,7 +77,7 @@ class Outbox:
         self._unjournaled: dict[Position, Event] = {}
         self._asked: dict[int, Ranges] = {}
         self._mark = self._backlog_at = self._fresh_at = FIRST
-        self._backlog_due_ns = 0
+        self._backlog_due_ns = self._heard_ns = 0
         self._backlog_ended = False
 
     def connected(self, now_ns: int) -> None:
@@ -129,6 +129,14 @@ class Outbox:
             return Verdict.BACKWARDS if backwards else Verdict.NOTHING_NEW
         self._delivered.add(boot, new)
         return Verdict.NEW
+
+    def heard(self, now_ns: int) -> None:
+        """Level 2 is there. If it was quiet, what would wait for it ever longer is sent again within the first patience."""
+        for flight in self._flights.values() if now_ns - self._heard_ns > 2 * self._retry_ns else ():
+            if flight.tries > 1:
+                flight.tries = 1
+                flight.due_ns = min(flight.due_ns, now_ns + int(self._retry_ns * self._jitter.random()))
+        self._heard_ns = now_ns
 
     def ask(self, boot: int, ranges: Iterable[tuple[int, int]]) -> None:
         """Level 2 lacks these, acknowledged or not (it may have lost its disk): they are sent again at the backlog's rate.

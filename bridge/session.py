@@ -48,6 +48,8 @@ REFUSAL_NS = 500_000_000
 """Pause between tellings of refusals to supervision."""
 REFUSALS = 20
 """Kinds of refusals told at a time."""
+SAID = 1000
+"""Kinds of trouble told; a hostile sender must not fill the memory."""
 JOURNAL_NS = 500_000_000
 """How often a missing journal is looked for."""
 
@@ -279,7 +281,9 @@ class Bridge:
     def _receive(self, message: Received, outbox: Outbox, now_ns: int) -> None:
         kind = message.topic.rpartition("/")[2]
         try:
-            if kind == "ack":
+            if kind == "ack" and message.retained:
+                self._refuse("ack", "retained: it may be of any age")
+            elif kind == "ack":
                 self._acknowledge(wire.decode(message.payload, wire.Ack), outbox)
             elif kind == "command":
                 self._command(message, now_ns)
@@ -290,6 +294,7 @@ class Bridge:
         if ack.unit != self.settings.unit:
             self._refuse("ack", f"for another unit ({ack.unit})")
             return
+        outbox.heard(self._clock.now_ns())
         verdict = outbox.acknowledge(ack.boot, ack.seq, ack.also)
         self.counters["ack"] += 1
         if verdict in (Verdict.NEVER_SENT, Verdict.BACKWARDS):
@@ -304,7 +309,7 @@ class Bridge:
         self._say_once(f"{kind} {reason[:20]}", f"{kind} from level 2 refused: {reason} (told once, then counted)")
 
     def _say_once(self, what: str, text: str) -> None:
-        if what not in self._said:
+        if what not in self._said and len(self._said) < SAID:
             self._said.add(what)
             self._say(text)
 
@@ -321,7 +326,7 @@ class Bridge:
         if isinstance(decision, Passed):
             self._instruct(decision, now_ns)
         elif isinstance(decision, Refused):
-            self._refuse_command(decision, now_ns)
+            self._refuse_command(decision, message.payload, now_ns)
         elif decision.outcome:
             self._publish_result(decision.id, decision.seq, decision.outcome, decision.reason)
         elif not any(passed.id == decision.id for passed, _ in self._commands.values()):
@@ -353,7 +358,7 @@ class Bridge:
             self._gate.remember(passed, outcome, reason)
             self._publish_result(passed.id, passed.seq, outcome, reason)
 
-    def _refuse_command(self, refused: Refused, now_ns: int) -> None:
+    def _refuse_command(self, refused: Refused, payload: bytes, now_ns: int) -> None:
         """Those with a key of ours get an answer each; strangers a few, lest they make us flood the network."""
         self.counters["command refused"] += 1
         self._say_once(f"command {refused.reason[:20]}",
@@ -362,12 +367,13 @@ class Bridge:
             self._refusals[refused.reason, refused.key] += 1
         if refused.known or now_ns >= self._answer_strangers_ns:
             self._answer_strangers_ns = max(self._answer_strangers_ns, now_ns if refused.known else now_ns + STRANGERS_NS)
-            self._publish_result(refused.id, refused.seq, "refused", refused.reason)
+            self._publish_result(refused.id, refused.seq, "refused", refused.reason, "" if refused.id else wire.digest(payload))
 
-    def _publish_result(self, id: str, seq: int, outcome: str, reason: str) -> None:
+    def _publish_result(self, id: str, seq: int, outcome: str, reason: str, digest: str = "") -> None:
         self._publish("result", wire.Result(unit=self.settings.unit, boot=self._boot(), seq=seq, t=self._clock.t(),
                                             utc=self._clock.utc(), utc_trusted=self._clock.trusted(), id=id,
-                                            outcome="done" if outcome == "done" else "refused", reason=reason[:1024]), qos=1)
+                                            outcome="done" if outcome == "done" else "refused", reason=reason[:1024],
+                                            digest=digest), qos=1)
 
     def _tell_refusals(self, now_ns: int) -> None:
         """Supervision makes alarms of refusals; it hears of them a few times a second at most."""

@@ -24,6 +24,8 @@ VALID = timedelta(days=825)
 LEVEL2 = "level2"
 BROKER = "broker"
 RESERVED = (LEVEL2, BROKER, "ca", "crl")
+KEY = "-key"
+"""Ends the name of the file of a private key."""
 CONFIGURATION = """\
 # mosquitto for a test site: only certificates of this site's authority come in, each unit only to its own topics.
 # Start: mosquitto -c {folder}/mosquitto.conf
@@ -129,7 +131,7 @@ def make_site(folder: Path, fleet: str, units: Sequence[str], hosts: Sequence[st
             wire.check_name(name, "fleet" if name == fleet else "unit")
         except wire.WireError as error:
             raise SiteError(str(error)) from None
-        if name in RESERVED and name in units:
+        if name in units and (name in RESERVED or name.endswith(KEY)):
             raise SiteError(f'unit "{name}": the site has a file of that name itself; call the unit otherwise')
     folder = folder.absolute()
     try:

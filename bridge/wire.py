@@ -6,6 +6,7 @@ fields it doesn't know and refuses a `schema` above its own.
 """
 from __future__ import annotations
 
+import hashlib
 import inspect
 import re
 import sys
@@ -37,9 +38,11 @@ RANGES = 64
 UP = ("connection", "monitor", "alarm", "result")
 DOWN = ("ack", "command")
 
-_NAME = re.compile(r"[^\s/+#$\x00-\x1f\x7f][^\s/+#\x00-\x1f\x7f]*")
+_FORBIDDEN = r"\s/+#\x00-\x1f\x7f-\x9f"
+_NAME = re.compile(f"[^${_FORBIDDEN}][^{_FORBIDDEN}]*")
 
-Name = Annotated[str, Meta(min_length=1, max_length=NAME_BYTES, pattern="^[^\\s/+#$][^\\s/+#]*$")]
+Name = Annotated[str, Meta(min_length=1, max_length=NAME_BYTES, pattern=f"^[^${_FORBIDDEN}][^{_FORBIDDEN}]*$(?!\n)")]
+"""One level of a topic, and harmless on a terminal. (Python's `$` alone would let a line end follow.)"""
 Version = Annotated[int, Meta(ge=1, le=SCHEMA)]
 Count = Annotated[int, Meta(ge=0, le=2**53 - 1)]
 Identity = Annotated[int, Meta(ge=1, le=2**53 - 1)]
@@ -151,11 +154,15 @@ class Order(Header, frozen=True, kw_only=True):
 
 
 class Result(Header, frozen=True, kw_only=True):
-    """The answer to a command. seq: the order's counter, 0 where it could not be read."""
+    """The answer to a command. seq: the order's counter, 0 where it could not be read; id: then empty.
+
+    digest: SHA-256 of the command's payload in hexadecimal, where id is empty: tells whose refusal it is.
+    """
 
     id: Annotated[str, Meta(max_length=NAME_BYTES)]
     outcome: Literal["done", "refused"]
     reason: Text = ""
+    digest: Annotated[str, Meta(max_length=64)] = ""
 
 
 Message = Connection | MonitorMessage | Alarm | Ack | Command | Result
@@ -201,6 +208,11 @@ def decode(payload: bytes, kind: type[M]) -> M:
         if isinstance(number, Decimal) and not _is_plain(number):
             raise WireError(f"{name} is no plain number")
     return message
+
+
+def shown(text: str) -> str:
+    """A text of someone else's as one line for a terminal: what would steer it, or feign a line of ours, is spelt out."""
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
 def check_name(name: str, what: str) -> str:
@@ -255,6 +267,11 @@ def monitor_message(sample: Monitor, seq: int) -> MonitorMessage:
 def signed_bytes(fleet: str, unit: str, body: str) -> bytes:
     """What the signature of a command covers: the topic too, so that no command serves another unit."""
     return f"{topic(fleet, unit, 'command')}\n{body}".encode()
+
+
+def digest(payload: bytes) -> str:
+    """See `Result`."""
+    return hashlib.sha256(payload).hexdigest()
 
 
 def schemas() -> dict[str, str]:

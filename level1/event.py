@@ -76,6 +76,30 @@ class Result(msgspec.Struct, frozen=True):
     reason: str = ""
 
 
+class Commanded(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A command that reached supervision and what came of it, as the journal keeps it; level 2 gets the `Result`.
+
+    after: seq of the last event before it in this boot. command, target, value, origin, by: see `Order`; id: level 2's name for
+    it, or supervision's where there is none. frames: what was sent for it.
+    """
+
+    unit: str
+    boot: int
+    after: int
+    t: Decimal
+    utc: str | None
+    utc_trusted: bool
+    command: str
+    target: str
+    value: Decimal | None
+    origin: str
+    by: str
+    id: str
+    outcome: str
+    reason: str = ""
+    frames: tuple[SentFrame, ...] = ()
+
+
 class Monitor(msgspec.Struct, frozen=True):
     """A monitoring message: state, never an alarm (SPEC §3).
 
@@ -100,9 +124,10 @@ _SPELT_OUT = Decimal("1e-6")
 """Below this a decimal is written as 1E-9."""
 _encoder = msgspec.json.Encoder(decimal_format="number")
 _decoder = msgspec.json.Decoder(Event, strict=False)
+_decode_commanded = msgspec.json.Decoder(Commanded, strict=False).decode
 
 
-def encode(event: Event | Monitor | Result) -> bytes:
+def encode(event: Event | Commanded | Monitor | Result) -> bytes:
     """One JSON object, keys in the order of the fields, no line end; times with nine places, the smallest too."""
     line = _encoder.encode(event)
     if not isinstance(event, Result) and abs(event.t) < _SPELT_OUT:
@@ -113,3 +138,8 @@ def encode(event: Event | Monitor | Result) -> bytes:
 def decode(line: bytes | str) -> Event:
     """The event of one JSON line. Raises msgspec.DecodeError (or its child ValidationError) on anything else."""
     return _decoder.decode(line)
+
+
+def decode_commanded(line: bytes | str) -> Commanded:
+    """The command of one JSON line. Raises as `decode`."""
+    return _decode_commanded(line)

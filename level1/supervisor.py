@@ -40,6 +40,8 @@ from level1.timer import FAR, Timed, Timers
 
 REQUEST_STORED = "request_dm2"
 """Order that asks a J1939 sender (target: its address) for the trouble codes it has stored."""
+COMMAND = "command"
+"""First word of the reason of frames sent for an order; its name follows."""
 UNTOLD = -1
 """Outcome of a condition before its first evaluation: whatever it is then, its alarm is told."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -156,7 +158,8 @@ class Supervisor:
     def command(self, order: Order, now_ns: int) -> Sequence[Output]:
         """An order from level 2 or from the machine. Always answered by a `Result`."""
         self._advance(now_ns)
-        reason = self._obey(order)
+        late = order.expires_ns is not None and now_ns > order.expires_ns
+        reason = "expired before supervision could obey it" if late else self._obey(order)
         self.board.settle(self.now_ns)
         self._out.append(Result(order.id, "refused" if reason else "done", reason))
         return self._take()
@@ -509,17 +512,29 @@ class Supervisor:
             return f"unknown command {order.name}"
         if order.name == "resume" and self.mode == "stopped" and order.origin == "above":
             return "the unit was stopped: it is started again at the machine"
-        for command in commands:
-            try:
-                self.send(self.now_ns, command.message, self._command_payload(command, order), f"command {order.name}")
-            except (Refused, ValueError) as refusal:
-                return str(refusal)
-        modes = {"pause": "paused" if self.mode == "running" else self.mode, "stop": "stopped", "resume": "running"}
-        mode = modes.get(order.name, self.mode)
+        if order.name == "stop":
+            self._change_mode("stopped")  # whatever becomes of its frames: nothing moves any more by our doing
+        refusals = [refusal for command in commands if (refusal := self._carry_out(command, order))]
+        if refusals:
+            return "; ".join(dict.fromkeys(refusals))
+        if order.name == "resume":
+            self._change_mode("running")
+        elif order.name == "pause" and self.mode == "running":
+            self._change_mode("paused")
+        return ""
+
+    def _carry_out(self, command: Command, order: Order) -> str:
+        """Send a command's message; gives the reason of a refusal."""
+        try:
+            self.send(self.now_ns, command.message, self._command_payload(command, order), f"{COMMAND} {order.name}")
+        except (Refused, ValueError) as refusal:
+            return str(refusal)
+        return ""
+
+    def _change_mode(self, mode: str) -> None:
         if mode != self.mode:
             self.mode = mode
             self._circumstances_changed(self.now_ns)
-        return ""
 
     def _people(self, order: Order) -> str:
         who = order.origin

@@ -94,20 +94,21 @@ class Commander:
         order = wire.Order(unit=wish.unit, boot=clock.boot, seq=self._signer.counter(), t=now, id=secrets.token_hex(8),
                            expires_t=now + wire.seconds(VALID_NS), name=wish.name, target=wish.target, value=wish.value)
         payload = wire.encode(signed(order, self._fleet, self._signer.key, self._signer.private))
+        ours = {order.id, wire.digest(payload)}
         self._results.clear()
         end_ns = time.monotonic_ns() + PATIENCE_NS
         while time.monotonic_ns() < end_ns:
             self._connection.publish(wire.topic(self._fleet, wish.unit, "command"), payload, qos=1)
-            if self._hear(lambda: self._answer(order) is not None, REPEAT_NS):
+            if self._hear(lambda: self._answer(ours) is not None, REPEAT_NS):
                 break
-        answer = self._answer(order)
+        answer = self._answer(ours)
         if answer is None:
             raise CommandError(f'unit "{wish.unit}": no answer within {PATIENCE_NS // 10**9} s; whether it obeyed is not known')
         return answer
 
-    def _answer(self, order: wire.Order) -> wire.Result | None:
-        """The answer to an order; one without id is to a sender that the unit doesn't know, which is us."""
-        return next((result for result in self._results if result.id == order.id or not result.id), None)
+    def _answer(self, ours: set[str]) -> wire.Result | None:
+        """By the id, or by the digest where the unit doesn't know us: a stranger's refusal must not look like ours."""
+        return next((result for result in self._results if (result.id or result.digest) in ours), None)
 
     def _hear(self, condition: Callable[[], bool], timeout_ns: int) -> bool:
         """Take in what comes until a condition holds. Raises CommandError when the broker is lost."""

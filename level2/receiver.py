@@ -150,7 +150,7 @@ class Receiver:
             elif isinstance(content, wire.MonitorMessage):
                 self._hear(topic, content, now_ns)
             elif isinstance(content, wire.Connection):
-                self._tell_connection(topic, content, message.retained, now_ns)
+                self._tell_connection(connection, topic, content, message.retained)
         if alarms:
             self._commit(connection, alarms)
 
@@ -232,12 +232,15 @@ class Receiver:
             self._silent.add(unit)
             self._say(f"{unit[1]} is silent: no monitoring message for {self.settings.silent_ns / 1e9:g} s")
 
-    def _tell_connection(self, topic: wire.Topic, state: wire.Connection, retained: bool, now_ns: int) -> None:
+    def _tell_connection(self, connection: MqttConnection, topic: wire.Topic, state: wire.Connection, retained: bool) -> None:
         waiting = f", {state.waiting} events to come" if state.waiting else ""
         alone = "" if state.supervising or state.state != "ONLINE" else ", its supervision is not running"
         self._say(f"{topic.unit} is {state.state}{' (as last known)' * retained}{alone}{waiting}")
         if state.state != "ONLINE":
             self._heard_ns.pop((topic.fleet, topic.unit), None)
+        else:
+            # we are here: a unit whose events went unanswered sends them less and less often
+            self._acknowledge(connection, Sender(topic.fleet, topic.unit, state.boot), ())
 
     def _say_once(self, what: str, text: str) -> None:
         if what not in self._said and len(self._said) < SAID:
@@ -291,7 +294,7 @@ def event_line(arrival: Arrival) -> str:
     notes = [note for note, true in (("passive", alarm.passive), ("late", alarm.historical),
                                      ("conflict", arrival.outcome is Outcome.CONFLICT)) if true]
     note_text = ", ".join(notes)
-    return f"{time} {alarm.unit} {alarm.alarm} {alarm.event}{attempt}  {alarm.text}{f' ({note_text})' if notes else ''}"
+    return wire.shown(f"{time} {alarm.unit} {alarm.alarm} {alarm.event}{attempt}  {alarm.text}{f' ({note_text})' if notes else ''}")
 
 
 def _filter(fleet: str, kind: str) -> str:

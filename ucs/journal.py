@@ -8,12 +8,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
+from heapq import merge
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 
-from level1.event import EVENTS, Event, encode
+from level1.event import EVENTS, Commanded, Event, encode
 from level1.io.config import ConfigError, duration_ns, load
 from level1.io.error import OutsideError
 from level1.io.journal import FIRST, JournalError, Position, Reader
@@ -22,15 +23,20 @@ POLL_S = 0.1
 CHUNK = 1000
 CSV_COLUMNS = ("unit", "boot", "seq", "t", "utc", "utc_trusted", "alarm", "code", "priority", "event", "instance", "attempt",
                "passive", "text", "values", "frames")
-Writer = Callable[[Event], None]
+COMMAND = "command"
+"""Stands for commands among the kinds of events."""
+Entry = Event | Commanded
+Writer = Callable[[Entry], None]
 _encoder = msgspec.json.Encoder(decimal_format="number")
 DESCRIPTION = """\
-Lists the events in a unit's journal, oldest first: time, boot.seq, alarm, event, text. Reads only; `ucs run` may be running.
+Lists what is in a unit's journal, oldest first: of events time, boot.seq, alarm, event, text; among them the commands that reached
+supervision, and what came of each. Reads only; `ucs run` may be running.
 """
 EPILOG = """\
 Times are UTC labels (2025-05-01, 2025-05-01T10:30, …10:30:05Z), or "15 min" and the like before now.
 
   ucs journal unit.toml --since "2 h" --alarm PilotFlameOut --values
+  ucs journal unit.toml --event command --values
   ucs journal unit.toml --follow
   ucs journal /media/card/journal.db --format csv > events.csv
 """
@@ -41,8 +47,8 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser("journal", help="list and export what a unit's journal holds", description=DESCRIPTION,
                                    epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("unit", metavar="unit.toml", type=Path, help="the unit's configuration, or a journal file (.db)")
-    parser.add_argument("--alarm", metavar="NAME", help="only this alarm")
-    parser.add_argument("--event", choices=EVENTS, help="only events of this kind")
+    parser.add_argument("--alarm", metavar="NAME", help="only this alarm, and commands about it")
+    parser.add_argument("--event", choices=(*EVENTS, COMMAND), help="only events of this kind, or commands")
     parser.add_argument("--since", metavar="TIME", help="only events from this time on; events without UTC are left out")
     parser.add_argument("--until", metavar="TIME", help="only events before this time")
     parser.add_argument("--boot", metavar="N", type=int, help="only this boot of the unit")
@@ -62,18 +68,18 @@ def run(args: argparse.Namespace) -> int:
         listing = Listing(reader, query)
         found = listing.new()
         count = 0
-        for event in found if args.last is None else deque(found, args.last):
-            write(event)
+        for entry in found if args.last is None else deque(found, args.last):
+            write(entry)
             count += 1
         if not count and not args.follow:
-            print("ucs journal: no event yet" if reader.last() == FIRST else "ucs journal: no such event", file=sys.stderr)
+            print("ucs journal: nothing yet" if reader.last() == FIRST else "ucs journal: nothing of the kind", file=sys.stderr)
         if args.follow:
             _follow(reader, listing, write)
     return 0
 
 
 class Query(NamedTuple):
-    """Which events; None: any. since and until compare with the UTC label."""
+    """Which events and commands; None: any. since and until compare with the UTC label."""
 
     alarm: str | None = None
     event: str | None = None
@@ -81,14 +87,18 @@ class Query(NamedTuple):
     until: datetime | None = None
     boot: int | None = None
 
-    def in_time(self, event: Event) -> bool:
-        """Whether the event is within the times asked for; one without UTC is not, when any is."""
+    def in_time(self, entry: Entry) -> bool:
+        """Whether it is within the times asked for; what has no UTC is not, when any is."""
         if self.since is None and self.until is None:
             return True
-        if event.utc is None:
+        if entry.utc is None:
             return False
-        utc = _utc(event.utc)
+        utc = _utc(entry.utc)
         return (self.since is None or utc >= self.since) and (self.until is None or utc < self.until)
+
+    def has_command(self, command: Commanded) -> bool:
+        """Whether a command is asked for."""
+        return self.event in (None, COMMAND) and self.alarm in (None, command.target) and self.boot in (None, command.boot)
 
 
 class Listing:
@@ -97,20 +107,37 @@ class Listing:
     def __init__(self, reader: Reader, query: Query):
         self._reader, self._query = reader, query
         self._after: Position = FIRST if query.boot is None else (query.boot, 0)
+        self._commands_after: Position = FIRST
         self._before: Position | None = None if query.boot is None else (query.boot + 1, 0)
 
-    def new(self) -> Iterator[Event]:
-        """The events asked for that were not given yet. Raises JournalError."""
+    def new(self) -> Iterator[Entry]:
+        """What was asked for and not given yet: events, and each command behind the events before it. Raises JournalError."""
+        entries: Iterator[Entry] = merge(self._events(), self._commands(), key=_place)
+        yield from filter(self._query.in_time, entries)
+
+    def _events(self) -> Iterator[Event]:
+        if self._query.event == COMMAND:
+            return
         end = self._reader.last()
         while True:
             events = self._reader.events(self._after, CHUNK, before=self._before, alarm=self._query.alarm, event=self._query.event)
             for event in events:
                 self._after = (event.boot, event.seq)
-                if self._query.in_time(event):
-                    yield event
+                yield event
             if len(events) < CHUNK:
                 break
         self._after = max(self._after, end)
+
+    def _commands(self) -> Iterator[Commanded]:
+        while commands := self._reader.commands(self._commands_after, CHUNK):
+            for position, command in commands:
+                self._commands_after = position
+                if self._query.has_command(command):
+                    yield command
+
+
+def _place(entry: Entry) -> tuple[int, int, bool]:
+    return (entry.boot, entry.seq, False) if isinstance(entry, Event) else (entry.boot, entry.after, True)
 
 
 def _follow(reader: Reader, listing: Listing, write: Writer) -> None:
@@ -123,8 +150,8 @@ def _follow(reader: Reader, listing: Listing, write: Writer) -> None:
                 news = list(listing.new()) if reader.changed() else []
             except JournalError:
                 continue  # being replaced; the reader finds the new one
-            for event in news:
-                write(event)
+            for entry in news:
+                write(entry)
     except KeyboardInterrupt:
         pass
 
@@ -159,36 +186,52 @@ def _utc(text: str) -> datetime:
 
 
 def _text_writer(values: bool) -> Writer:
-    def write(event: Event) -> None:
-        moment = event.utc or f"{event.t:.3f} s"
-        attempt = f" {event.attempt}" if event.attempt else ""
-        unsure = event.utc is not None and not event.utc_trusted
-        notes = " (passive)" * event.passive + " (clock not synchronised)" * unsure
-        print(f"{moment}  {event.boot}.{event.seq}  {event.alarm}  {event.event}{attempt}  {event.text}{notes}")
+    def write(entry: Entry) -> None:
+        moment = entry.utc or f"{entry.t:.3f} s"
+        unsure = " (clock not synchronised)" * (entry.utc is not None and not entry.utc_trusted)
+        if isinstance(entry, Commanded):
+            print(f"{moment}  {entry.boot}  {COMMAND}  {_told(entry)}{unsure}")
+        else:
+            attempt = f" {entry.attempt}" if entry.attempt else ""
+            notes = " (passive)" * entry.passive + unsure
+            print(f"{moment}  {entry.boot}.{entry.seq}  {entry.alarm}  {entry.event}{attempt}  {entry.text}{notes}")
         if values:
-            for name, value in event.values.items():
+            for name, value in entry.values.items() if isinstance(entry, Event) else ():
                 print(f"    {name} = {value}")
-            for frame in event.frames:
+            for frame in entry.frames:
                 print(f"    sent {frame.message} {frame.id}#{frame.data}")
     return write
 
 
-def _write_json(event: Event) -> None:
-    print(encode(event).decode())
+def _told(command: Commanded) -> str:
+    """`reduce_speed 2 by chief (c-17): done`."""
+    value = "" if command.value is None else f" {command.value}"
+    target = f" {command.target}" if command.target else ""
+    reason = f": {command.reason}" if command.reason else ""
+    who = command.by or ("someone at the machine" if command.origin == "local" else "level 2")
+    return f"{command.command}{target}{value} by {who} ({command.id}): {command.outcome}{reason}"
+
+
+def _write_json(entry: Entry) -> None:
+    print(encode(entry).decode())
 
 
 def _csv_writer() -> Writer:
-    """Columns as the keys of an event; values and frames as JSON in one cell each."""
+    """Columns as the keys of an event; values and frames as JSON in one cell each. A command has the `seq` of the event before."""
     writer = csv.writer(sys.stdout, lineterminator="\n")
     started = False
 
-    def write(event: Event) -> None:
+    def write(entry: Entry) -> None:
         nonlocal started
         if not started:
             writer.writerow(CSV_COLUMNS)
             started = True
-        cells = {name: getattr(event, name) for name in CSV_COLUMNS}
-        writer.writerow((cells | {"values": _json(event.values), "frames": _json(event.frames)}).values())
+        cells = dict.fromkeys(CSV_COLUMNS, "") | {name: getattr(entry, name) for name in CSV_COLUMNS if hasattr(entry, name)}
+        if isinstance(entry, Event):
+            cells["values"] = _json(entry.values)
+        else:
+            cells |= {"seq": entry.after, "alarm": entry.target, "event": COMMAND, "text": _told(entry)}
+        writer.writerow((cells | {"frames": _json(entry.frames)}).values())
     return write
 
 

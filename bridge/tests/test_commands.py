@@ -96,8 +96,9 @@ def test_a_command_sent_twice_is_obeyed_once_and_answered_twice(site: Site) -> N
 
 
 def test_a_stranger_is_refused_and_supervision_told(site: Site) -> None:
-    site.send(private=Ed25519PrivateKey.generate())
+    payload = site.send(private=Ed25519PrivateKey.generate())
     assert site.results(1) == [("", 0, "refused", "wrong signature")]
+    assert site.peer.messages(wire.Result)[0].digest == wire.digest(payload)
     eventually(lambda: site.link.receive() or site.link.refusals)
     assert (site.link.refusals[0].reason, site.link.refusals[0].key) == ("wrong signature", "chief")
     assert site.obeyed == []

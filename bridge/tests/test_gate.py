@@ -46,7 +46,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def gate(path: Path) -> Iterator[Gate]:
-    gate = Gate(path, FLEET, UNIT, KEYS, NOW)
+    gate = Gate(path, FLEET, UNIT, KEYS, NOW - 600 * S)
     yield gate
     gate.close()
 
@@ -64,7 +64,8 @@ def test_a_good_command_becomes_an_order(gate: Gate) -> None:
     passed = decide(gate, sealed(an_order(7, name="reduce_speed", value=Decimal("2.5"))))
     assert isinstance(passed, Passed)
     assert (passed.id, passed.seq) == ("c-7", 7)
-    assert msgspec.structs.replace(passed.order, id="") == Order("", "reduce_speed", "", Decimal("2.5"), "above")
+    assert passed.order == Order(f"{KEYS['reset'].fingerprint}-7", "reduce_speed", "", Decimal("2.5"), "above", NOW + 5 * S,
+                                 "reset", "c-7")
 
 
 # Who
@@ -209,6 +210,25 @@ def test_lost_counters_let_nothing_old_in(path: Path, damage: bytes) -> None:
     assert isinstance(decide(gate, sealed(an_order(t=seconds(NOW)))), Passed)
     assert path.with_name(path.name + ".corrupt").read_bytes() == damage
     gate.close()
+
+
+def test_counters_taken_away_let_nothing_old_in_either(gate: Gate, path: Path) -> None:
+    captured = sealed(an_order(5))
+    assert isinstance(decide(gate, captured), Passed)
+    for file in path.parent.iterdir():
+        file.unlink()
+    for begun_ns in (NOW, NOW + S):  # and a restart of the bridge does not make it forget that
+        again = Gate(path, FLEET, UNIT, KEYS, begun_ns)
+        assert reason(decide(again, captured, NOW + 2 * S)) == "issued before the unit lost its counters"
+        assert isinstance(decide(again, sealed(an_order(begun_ns, t=seconds(NOW)), "pause")), Passed)
+        again.close()
+
+
+def test_a_clock_that_began_anew_makes_no_command_late(path: Path) -> None:
+    Gate(path, FLEET, UNIT, KEYS, NOW).close()
+    rebooted = Gate(path, FLEET, UNIT, KEYS, 20 * S)
+    assert isinstance(decide(rebooted, sealed(an_order(t=seconds(21 * S), expires_t=seconds(30 * S))), 22 * S), Passed)
+    rebooted.close()
 
 
 def test_a_folder_that_cannot_be_written_is_told() -> None:

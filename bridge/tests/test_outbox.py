@@ -90,6 +90,22 @@ def test_an_event_is_sent_again_later_and_later_until_it_is_acknowledged(unit: U
     assert unit.outbox.next_due_ns() is None
 
 
+def test_a_level_2_that_is_back_need_not_wait_for_the_longest_pause(unit: Unit) -> None:
+    unit.outbox.connected(0)
+    unit.write(1, 2)
+    now = 0
+    for _ in range(20):
+        unit.outbox.due(now)
+        now = unit.outbox.next_due_ns() or 0
+    unit.outbox.due(now)
+    assert unit.outbox.due(now + RETRY_NS) == []
+    unit.outbox.heard(now)
+    assert sorted(seqs(unit.outbox.due(now + RETRY_NS))) == [1, 2]
+    for second in range(1, 60):  # one that refuses an event and takes others in is not pressed
+        unit.outbox.heard(now + second * S)
+    assert len(unit.outbox.due(now + 60 * S)) == 2
+
+
 def test_the_window_bounds_what_is_in_flight(unit: Unit) -> None:
     unit.outbox.connected(0)
     unit.write(*range(1, 101))

@@ -141,6 +141,16 @@ def test_an_acknowledgement_of_what_was_never_sent_is_refused(unit: Unit, peer: 
         eventually(lambda: delivered_upto(delivered_path(unit.path)) == {1: 2})
 
 
+def test_a_retained_acknowledgement_is_refused(unit: Unit, peer: Peer) -> None:
+    unit.write(1)
+    ack = wire.encode(wire.Ack(unit=UNIT, boot=1, seq=1, t=seconds(1)))
+    peer.connection.publish(wire.topic(FLEET, UNIT, "ack"), ack, 1, retain=True)
+    with start(unit) as bridge:
+        peer.until(lambda: bridge.counters["ack refused"] == 1)
+        peer.until(lambda: peer.seqs().count(1) >= 2)
+    assert any("retained: it may be of any age" in line for line in unit.said)
+
+
 def test_a_packet_of_10_mb_ends_a_connection_and_nothing_else(unit: Unit, peer: Peer, broker: Broker) -> None:
     unit.write(1)
     with start(unit) as bridge:

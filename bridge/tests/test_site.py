@@ -156,7 +156,8 @@ def test_private_keys_are_for_their_owner_alone(site: Site) -> None:
 
 
 @pytest.mark.parametrize(("fleet", "units", "told"), [
-    ("a/b", ["t"], "can't stand in an MQTT topic"), ("farm", ["level2"], "the site has a file of that name itself")])
+    ("a/b", ["t"], "can't stand in an MQTT topic"), ("farm", ["level2"], "the site has a file of that name itself"),
+    ("farm", ["broker-key"], "the site has a file of that name itself")])
 def test_names_that_do_not_do_are_told(tmp_path: Path, fleet: str, units: list[str], told: str) -> None:
     with pytest.raises(SiteError, match=told):
         make_site(tmp_path / "site", fleet, units, ["localhost"])

@@ -102,7 +102,8 @@ def test_topics_are_built_and_taken_apart(kind: str, message: str, text: str) ->
     assert wire.parse_topic(text) == ("north-farm", "tractor-7", kind, message)
 
 
-@pytest.mark.parametrize("name", ["", "a/b", "a+b", "#", "$SYS", "two words", "a\0b", "x" * 65, "tab\t", "ü" * 40])
+@pytest.mark.parametrize("name", ["", "a/b", "a+b", "#", "$SYS", "two words", "a\0b", "x" * 65, "tab\t", "ü" * 40, "esc\x1b[2J",
+                                  "csi\x9b2J", "line\n"])
 def test_names_that_cannot_stand_in_a_topic_are_refused(name: str) -> None:
     with pytest.raises(wire.WireError, match="can't stand in an MQTT topic"):
         wire.topic("farm", name, "alarm")
@@ -113,6 +114,16 @@ def test_names_that_cannot_stand_in_a_topic_are_refused(name: str) -> None:
 def test_other_topics_are_refused(topic: str) -> None:
     with pytest.raises(wire.WireError):
         wire.parse_topic(topic)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "$SYS", "two words", "esc\x1b[2J", "csi\x9b2J", "line\n", "x" * 65])
+def test_names_in_messages_keep_the_same_rules(name: str) -> None:
+    with pytest.raises(wire.WireError):
+        wire.decode(json.dumps({"key": name, "body": "", "signature": ""}).encode(), wire.Command)
+
+
+def test_what_would_steer_a_terminal_or_feign_a_line_is_spelt_out() -> None:
+    assert wire.shown("Düse \x1b[2J\nunit \u202e") == r"Düse \x1b[2J\nunit \u202e"
 
 
 # Hostile and future payloads

@@ -20,10 +20,11 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import IO
 
-from level1.event import Event
+from level1.event import Commanded, Event
 from level1.io.ballast import Ballast
 from level1.io.bootfile import BootFile
 from level1.io.journal_file import (
@@ -43,6 +44,8 @@ __all__ = ["FIRST", "Journal", "JournalError", "Position", "Reader", "read_event
 
 QUEUE_EVENTS = 10_000
 """Events that wait in memory at most (about 10 MB); beyond it the oldest are lost and counted."""
+QUEUE_COMMANDS = 1_000
+"""Commands that wait in memory at most."""
 KEEP_BYTES = 256 << 20
 """Size from which `prune` drops events: a few hundred thousand."""
 PATIENCE_NS = 250_000_000
@@ -51,6 +54,10 @@ RETRY_S = 1.0
 """Pause before another try while something is wrong; each `append` is a try too."""
 DROP_EVENTS = 500
 """Events dropped in one transaction."""
+
+
+Commands = Sequence[tuple[int, Commanded]]
+"""Commands, each with its number within the boot."""
 
 
 class Journal:
@@ -68,6 +75,8 @@ class Journal:
         self._lock = _locked(self.path)
         self._queue_events, self._keep_bytes, self._patience_ns = queue_events, keep_bytes, patience_ns
         self._queue: deque[Event] = deque()
+        self._commands: deque[tuple[int, Commanded]] = deque(maxlen=QUEUE_COMMANDS)
+        self._numbers = count(1)
         self._state: bytes | None = None
         self._incidents: list[str] = []
         self._delivered: Mapping[int, int] | None = None
@@ -92,13 +101,14 @@ class Journal:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def append(self, events: Sequence[Event], state: bytes) -> bool:
-        """Write events and the supervisor's state after them in one transaction.
+    def append(self, events: Sequence[Event], state: bytes, commands: Sequence[Commanded] = ()) -> bool:
+        """Write events, commands and the supervisor's state after them in one transaction.
 
         True: all of it, and all that waited before, is on the disk. False: it waits in memory, and `fault` says why.
         """
         with self._changed:
             self._queue.extend(events)
+            self._commands.extend((next(self._numbers), command) for command in commands)
             self._state = state
             while len(self._queue) > self._queue_events:
                 self._queue.popleft()
@@ -216,13 +226,15 @@ class Journal:
                     self._take_ballast()
                     continue
                 closing, ticket = self._closing, self._asked
-                batch, state = tuple(self._queue), self._state
+                batch, state, commands = tuple(self._queue), self._state, tuple(self._commands)
                 delivered, self._delivered = self._delivered, None
             start_ns = time.monotonic_ns()
-            trouble = self._attempt(batch, state)
+            trouble = self._attempt(batch, state, commands)
             slow = time.monotonic_ns() - start_ns > self._patience_ns
             with self._changed:
                 self._settle(ticket, batch, trouble, slow)
+                if not trouble:
+                    self._forget(commands)
             if delivered is not None and not trouble:
                 self._drop(delivered)
             if closing:
@@ -246,10 +258,15 @@ class Journal:
                 self._queue.popleft()
         self._changed.notify_all()
 
-    def _attempt(self, batch: Sequence[Event], state: bytes | None) -> str:
+    def _forget(self, commands: Commands) -> None:
+        """These are on the disk."""
+        while self._commands and commands and self._commands[0][0] <= commands[-1][0]:
+            self._commands.popleft()
+
+    def _attempt(self, batch: Sequence[Event], state: bytes | None, commands: Commands) -> str:
         """Bring everything on the disk. Gives what stood in the way, "" for success."""
         try:
-            self._commit(batch, state)
+            self._commit(batch, state, commands)
             self._take_ballast()
             return ""
         except sqlite3.Error as error:
@@ -259,32 +276,32 @@ class Journal:
         except Exception as error:  # a thread that ended would take the journal with it
             return f"can't be written ({type(error).__name__}: {error})"
 
-    def _commit(self, batch: Sequence[Event], state: bytes | None) -> None:
+    def _commit(self, batch: Sequence[Event], state: bytes | None, commands: Commands) -> None:
         """Write, with what helps against a file that vanished or is corrupt and against a full disk."""
         if not self._file.in_place:
             self._replace()
         try:
-            self._file.commit(self.boot, batch, state)
+            self._file.commit(self.boot, batch, state, commands)
         except sqlite3.Error as error:
             if is_corrupt(error):
                 self._file.close()
                 self._file = self._connect(self.boot)
-                self._file.commit(self.boot, batch, state)
+                self._file.commit(self.boot, batch, state, commands)
             elif code(error) == sqlite3.SQLITE_FULL:
-                self._commit_on_full_disk(batch, state)
+                self._commit_on_full_disk(batch, state, commands)
             else:
                 raise
 
-    def _commit_on_full_disk(self, batch: Sequence[Event], state: bytes | None) -> None:
+    def _commit_on_full_disk(self, batch: Sequence[Event], state: bytes | None, commands: Commands) -> None:
         self._file.reuse_log()
         try:
-            self._file.commit(self.boot, batch, state)
+            self._file.commit(self.boot, batch, state, commands)
         except sqlite3.Error as error:
             if code(error) != sqlite3.SQLITE_FULL or not self._ballast.release():
                 raise
             self._file.save_space(True)
             self._file.reuse_log()
-            self._file.commit(self.boot, batch, state)
+            self._file.commit(self.boot, batch, state, commands)
 
     def _replace(self) -> None:
         gone = not self.path.exists()

@@ -1,6 +1,8 @@
 """The journal's SQLite file: its tables, its versions, what to do when it is corrupt."""
 from __future__ import annotations
 
+import json
+import mmap
 import os
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -9,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from level1.event import Event, decode, encode
+from level1.event import Commanded, Event, decode, encode
 from level1.io.bootfile import sync_folder
 from level1.io.error import OutsideError
 
@@ -19,6 +21,15 @@ FIRST = (0, 0)
 """The position before every event."""
 INSERT = "INSERT OR IGNORE INTO event VALUES (?, ?, ?, ?, ?)"
 """OR IGNORE: a try that failed half-way may have got there; an identity is never used twice."""
+
+LINE_BEGINS = b'{"unit":"'
+LINE_BYTES = 1100
+"""A longer line does not lie on one page."""
+INSERT_COMMAND = "INSERT OR IGNORE INTO command VALUES (?, ?, ?)"
+KEEP_COMMANDS = 10_000
+"""Commands kept at most (about 4 MB); the oldest go."""
+
+_json = json.JSONDecoder()
 
 Position = tuple[int, int]
 """(boot, seq): which event, in the order in which they happened."""
@@ -41,7 +52,12 @@ def _create(connection: sqlite3.Connection) -> None:
                        " PRIMARY KEY (boot, seq)) WITHOUT ROWID")
 
 
-MIGRATIONS: tuple[Callable[[sqlite3.Connection], None], ...] = (_create,)
+def _add_commands(connection: sqlite3.Connection) -> None:
+    """Commands and the frames sent for them; number counts them within a boot."""
+    connection.execute("CREATE TABLE command (boot INTEGER, number INTEGER, line BLOB, PRIMARY KEY (boot, number)) WITHOUT ROWID")
+
+
+MIGRATIONS: tuple[Callable[[sqlite3.Connection], None], ...] = (_create, _add_commands)
 """Step n makes a file of schema version n into one of version n + 1, all in the transaction that opens the file."""
 
 
@@ -63,12 +79,20 @@ class JournalFile:
         """Whether the file is still the one at its path: SQLite would write on into a deleted file without a word."""
         return self._identity is not None and identity(self.path) == self._identity
 
-    def commit(self, boot: int, events: Iterable[Event], state: bytes | None) -> None:
-        """Write in one transaction; on the disk when it returns. Always writes something: success means it works."""
+    def commit(self, boot: int, events: Iterable[Event], state: bytes | None,
+               commands: Iterable[tuple[int, Commanded]] = ()) -> None:
+        """Write in one transaction; on the disk when it returns. Always writes something: success means it works.
+
+        commands: with their numbers within their boot.
+        """
         connection = self.connection
         connection.execute("BEGIN IMMEDIATE")
         try:
             connection.executemany(INSERT, map(_row, events))
+            for number, command in commands:
+                connection.execute(INSERT_COMMAND, (command.boot, number, encode(command)))
+                connection.execute("DELETE FROM command WHERE (boot, number) <= (SELECT boot, number FROM command "
+                                   "ORDER BY boot DESC, number DESC LIMIT 1 OFFSET ?)", (KEEP_COMMANDS,))
             if state is None:
                 connection.execute("INSERT OR REPLACE INTO boot VALUES (?)", (boot,))
             else:
@@ -111,7 +135,7 @@ class JournalFile:
             f"(SELECT boot, seq FROM event WHERE {where} ORDER BY boot, seq LIMIT {count})", values).rowcount
 
     def salvage(self, kept: Path) -> int:
-        """Copy in what a corrupt file still gives, from both ends; the number of events saved."""
+        """Copy in what a corrupt file still gives, by its tables, then from its bytes; the number of events saved."""
         before = self.connection.total_changes
         old = sqlite3.connect(kept, isolation_level=None)
         try:
@@ -119,7 +143,12 @@ class JournalFile:
                 self.connection.execute("BEGIN IMMEDIATE")
                 self.connection.executemany(INSERT, _valid(_readable(old, f"SELECT line FROM event ORDER BY {order}")))
                 self.connection.execute("COMMIT")
+            self.connection.execute("BEGIN IMMEDIATE")
+            self.connection.executemany(INSERT, _valid((line,) for file in (kept, beside(kept, "-wal")) for line in _carved(file)))
+            self.connection.execute("COMMIT")
             saved = self.connection.total_changes - before
+            for row in _readable(old, "SELECT boot, number, line FROM command"):
+                self.connection.execute(INSERT_COMMAND, row)
             for boot, snapshot in _readable(old, "SELECT boot, snapshot FROM state"):
                 if isinstance(boot, int) and isinstance(snapshot, bytes):
                     self.connection.execute("INSERT OR REPLACE INTO state VALUES (1, ?, ?)", (boot, snapshot))
@@ -281,3 +310,18 @@ def _valid(rows: Iterator[tuple[object, ...]]) -> Iterator[tuple[int, int, str, 
             yield _row(decode(line if isinstance(line, bytes) else b""))
         except msgspec.DecodeError:
             continue
+
+
+def _carved(path: Path) -> Iterator[bytes]:
+    """JSON objects that may be events, wherever they stand in a file: a damaged page of an index hides sound ones below it."""
+    try:
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            at = content.find(LINE_BEGINS)
+            while at >= 0:
+                with suppress(ValueError):
+                    # as Latin-1, in which a character is a byte; what is structure in JSON is ASCII
+                    _, length = _json.raw_decode(content[at:at + LINE_BYTES].decode("latin-1"))
+                    yield content[at:at + length]
+                at = content.find(LINE_BEGINS, at + 1)
+    except (OSError, ValueError):
+        return  # not there, or empty

@@ -2,14 +2,16 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
-from level1.event import Event, decode
+from level1.event import Commanded, Event, decode, decode_commanded
 from level1.io.journal_file import FIRST, Position, identity, open_for_reading, unreadable
+
+T = TypeVar("T")
 
 
 class Reader:
@@ -53,7 +55,15 @@ class Reader:
         where += "".join(f" AND {column} = ?" for column, _ in names)
         rows = self._rows(f"SELECT line FROM event WHERE {where} ORDER BY boot, seq LIMIT {int(limit)}",
                           [*values, *(name for _, name in names)])
-        return [found for line, in rows if (found := self._decoded(line))]
+        return [found for line, in rows if (found := self._decoded(line, decode))]
+
+    def commands(self, after: Position = FIRST, limit: int = 1000) -> list[tuple[Position, Commanded]]:
+        """Commands after a (boot, number), in order, at most `limit`, each with its own (boot, number)."""
+        if not self._scalar("SELECT count(*) FROM sqlite_master WHERE name = 'command'"):
+            return []  # written by an earlier version, which `ucs run` has not opened since
+        rows = self._rows("SELECT boot, number, line FROM command WHERE (boot, number) > (?, ?) ORDER BY boot, number "
+                          f"LIMIT {int(limit)}", after)
+        return [((boot, number), found) for boot, number, line in rows if (found := self._decoded(line, decode_commanded))]
 
     def last(self) -> Position:
         """The newest event's position, `FIRST` in a journal without events."""
@@ -94,7 +104,7 @@ class Reader:
         self._connection = open_for_reading(self.path)
         self._version = -1
 
-    def _decoded(self, line: bytes) -> Event | None:
+    def _decoded(self, line: bytes, decode: Callable[[bytes], T]) -> T | None:
         try:
             return decode(line)
         except (msgspec.DecodeError, TypeError):

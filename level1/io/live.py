@@ -20,7 +20,8 @@ import msgspec
 
 from level1 import bus_health, health
 from level1.bus_health import Report
-from level1.event import Event, Monitor, Output, Result, Send
+from level1.command import Order
+from level1.event import Commanded, Event, Monitor, Output, Result, Send, SentFrame, seconds
 from level1.frame import BUS_SHIFT, EXTENDED, Frame
 from level1.health import Reading
 from level1.io.can import Port
@@ -29,7 +30,7 @@ from level1.io.inbox import Inbox
 from level1.io.listening import listening
 from level1.j1939_node import ADDRESS_CLAIMED
 from level1.memory import State
-from level1.supervisor import Supervisor
+from level1.supervisor import COMMAND, Supervisor
 
 LAG_NS = 2_000_000
 """Deadlines are served so late, that a frame stamped before one, which its reader hands over a moment later, still counts."""
@@ -49,8 +50,8 @@ _stamp = itemgetter(0)
 class EventStore(Protocol):
     """What the loop needs of `level1.io.journal.Journal`."""
 
-    def append(self, events: Sequence[Event], state: bytes) -> bool:
-        """Write events and the state after them; True when they are on the disk."""
+    def append(self, events: Sequence[Event], state: bytes, commands: Sequence[Commanded] = ()) -> bool:
+        """Write events, commands and the state after them; True when they are on the disk."""
 
     @property
     def fault(self) -> str | None:
@@ -163,8 +164,7 @@ class Live:
         frames.sort(key=_stamp)
         outputs = self._feed(frames, self._readings(frames, now_ns))
         self._served_ns = max(self._served_ns, now_ns - LAG_NS, self.supervisor.now_ns)
-        for order in load.orders:
-            outputs.extend(self.supervisor.command(order, self._served_ns))
+        commands = [self._command(order, outputs) for order in load.orders]
         deadline = self.supervisor.next_deadline()
         if deadline is not None and deadline <= self._served_ns:
             outputs.extend(self.supervisor.tick(self._served_ns))
@@ -172,7 +172,20 @@ class Live:
             outputs.extend(self._tell(load.reports, load.dropped, now_ns))
         if outputs or self._retry_ns is not None or now_ns - self._delivered_ns >= QUIET_NS:
             self._delivered_ns = now_ns
-            self._deliver(outputs)
+            self._deliver(outputs, commands)
+
+    def _command(self, order: Order, outputs: list[Output]) -> Commanded:
+        """Have an order obeyed; gives what the journal is to know of it."""
+        supervisor, now_ns = self.supervisor, self._served_ns
+        outputs += supervisor.tick(now_ns)
+        after = supervisor.seq
+        found = supervisor.command(order, now_ns)
+        outputs += found
+        frames = tuple(sent_frame(send) for send in found if isinstance(send, Send) and send.reason == f"{COMMAND} {order.name}")
+        result = next(output for output in found if isinstance(output, Result))
+        return Commanded(supervisor.unit, supervisor.boot, after, seconds(now_ns), supervisor.utc(now_ns), supervisor.utc_trusted,
+                         order.name, order.target, order.value, order.origin, order.by, order.called or order.id, result.outcome,
+                         result.reason, frames)
 
     def _wait(self, patience_s: float) -> None:
         """Until something comes; on a busy bus until enough has come."""
@@ -268,12 +281,12 @@ class Live:
         raws = health.raws(self.supervisor.catalog.messages[reading.message], reading.values)
         return self.supervisor.publish(reading.t_ns, reading.message, raws, reading.message not in self._quiet)
 
-    def _deliver(self, outputs: Sequence[Output]) -> None:
+    def _deliver(self, outputs: Sequence[Output], commands: Sequence[Commanded] = ()) -> None:
         """Durable first; then to the buses; then upward."""
         events = [output for output in outputs if isinstance(output, Event)]
         upward = [output for output in outputs if isinstance(output, Monitor | Result)]
         if events or any(isinstance(output, Result) for output in upward):
-            self.journal.append(events, encode_state(self.supervisor.state()))
+            self.journal.append(events, encode_state(self.supervisor.state()), commands)
         now_ns = self._clock()
         sends = [output for output in outputs if isinstance(output, Send)]
         self._follow(sends)
@@ -314,6 +327,11 @@ class Live:
         offset_ns = None if self._synchronised or self._gnss is None else self._gnss.utc_offset_ns()
         self.supervisor.utc_offset_ns = self._wall() - now_ns if offset_ns is None else offset_ns
         self.supervisor.utc_trusted = self._synchronised or offset_ns is not None
+
+
+def sent_frame(send: Send) -> SentFrame:
+    """A frame as events and commands name it."""
+    return SentFrame(send.message, f"{send.key & 0x1FFF_FFFF:0{8 if send.key & EXTENDED else 3}X}", send.data.hex().upper())
 
 
 def encode_state(state: State) -> bytes:

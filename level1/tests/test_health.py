@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from level1 import health
 from level1.decode import ERROR, GOOD, UNAVAILABLE, Scale, encode, quality_of, raw_of
-from level1.event import Event, Send
+from level1.event import Commanded, Event, Send
 from level1.frame import Frame, frame_key
 from level1.health import (
     GNSS_MESSAGES,
@@ -277,7 +277,7 @@ class Fixed:
     def utc_offset_ns(self) -> int | None:
         return self.offset_ns
 
-    def append(self, events: Sequence[Event], state: bytes) -> bool:
+    def append(self, events: Sequence[Event], state: bytes, commands: Sequence[Commanded] = ()) -> bool:
         return True
 
     def record(self, frames: Sequence[Any]) -> None:

@@ -6,6 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from decimal import Decimal
 from typing import Any
 
 import can
@@ -17,7 +18,7 @@ from level1.bus_health import Report
 from level1.catalog import Catalog
 from level1.command import Order
 from level1.decode import encode
-from level1.event import Event, Monitor, Result, Send
+from level1.event import Commanded, Event, Monitor, Result, Send, SentFrame
 from level1.frame import ERROR, EXTENDED, Frame, frame_key
 from level1.io import live
 from level1.io.can import WAITING_SENDS, BusError, Interface, Port, open_bus
@@ -439,9 +440,11 @@ class Journal:
         self.log = log
         self.fault: str | None = None
         self.incidents: tuple[str, ...] = ()
+        self.commands: list[Commanded] = []
 
-    def append(self, events: Sequence[Event], state: bytes) -> bool:
+    def append(self, events: Sequence[Event], state: bytes, commands: Sequence[Commanded] = ()) -> bool:
         live.decode_state(state)
+        self.commands += commands
         self.log.append(("journal", [event.event for event in events]))
         return self.fault is None
 
@@ -561,6 +564,19 @@ class TestLive:
         unit.inbox.order(Order("c1", "pause"))
         happened = unit.turn_at(1_010)
         assert happened[0] == ("journal", []) and ("link", Result("c1", "done", "")) in happened
+
+    def test_a_command_is_journaled_with_its_frames_and_what_came_of_it(self) -> None:
+        unit = Unit(load(["vehicle.dbc"]))
+        unit.turn_at(1_002)
+        unit.inbox.order(Order("c1", "reduce_speed", value=Decimal(2), by="chief", called="c-17"))
+        unit.inbox.order(Order("c2", "reduce_speed", expires_ns=1_007 * MS))
+        unit.turn_at(1_010)
+        done, late = unit.journal.commands
+        assert (done.command, done.value, done.by, done.id, done.outcome) == ("reduce_speed", Decimal(2), "chief", "c-17", "done")
+        frame, = [entry for entry in unit.log if entry[0] == "bus" and entry[1] == 0x100]
+        assert done.frames == (SentFrame("VEHICLE_CMD", "100", frame[2].hex().upper()),)
+        assert (late.id, late.outcome, late.frames) == ("c2", "refused", ())
+        assert late.reason == "expired before supervision could obey it"
 
     def test_monitoring_goes_upward_and_not_into_the_journal(self, catalog: Catalog) -> None:
         unit = Unit(catalog, monitor_ns=250 * MS)

@@ -4,10 +4,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import msgspec
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from level1.catalog import Repair
+from level1.catalog import Command, Repair
 from level1.command import Order
 from level1.event import Event, Output, Result, Send
 from level1.expression import ExpectStep, ResendStep, SendStep
@@ -21,6 +22,7 @@ from level1.tests.build import (
     SECOND,
     STATUS,
     alarm,
+    catalog,
     compare,
     events,
     message,
@@ -251,6 +253,28 @@ def test_a_command_message_serves_one_repair_at_a_time_and_the_higher_priority_t
     outcome = tool.run(1)
     assert ("Burner", "repair_failed") in [(name, what) for _, name, what in outcome]
     assert target.alarm_states()["PilotFlameOut"] == 2 and target.alarm_states()["Burner"] != 2
+
+
+def test_a_stop_whose_frame_a_repair_holds_stops_every_repair_all_the_same_and_says_so() -> None:
+    target = Supervisor(msgspec.structs.replace(catalog([STATUS, COMMAND], [pilot_flame_out()]), commands={
+        name: Command(name, "FLAMER_CMD", {"GasValve": 0, "Igniter": 0}) for name in ("stop", "pause")}), unit="a", broadcast=False)
+    tool = Flamer(target)
+    tool.run(1)
+    tool.flame = 0
+    tool.run(1)
+    assert target.alarm_states()["PilotFlameOut"] == 2
+    assert "belongs to the repair of PilotFlameOut" in tool.order("pause").reason and target.mode == "running"
+    outcome = target.command(Order("c", "stop"), tool.now)
+    assert "belongs to the repair of PilotFlameOut" in outcome[-1].reason and target.mode == "stopped"  # type: ignore[union-attr]
+    assert [name for _, _, name in events(outcome)] == ["repair_failed"] and sends(outcome, "FLAMER_CMD")[-1].data[0] == 0
+    tool.run(120)
+    assert not any(send.data[0] & 1 for send in sends(tool.outputs[-100:], "FLAMER_CMD"))
+
+
+def test_an_order_that_reaches_supervision_late_is_refused() -> None:
+    target = supervisor([STATUS, COMMAND], [pilot_flame_out()], start_ns=0)
+    for now, outcome in ((5 * SECOND, "done"), (5 * SECOND + 1, "refused")):
+        assert target.command(Order("c", "pause", expires_ns=5 * SECOND), now)[-1].outcome == outcome  # type: ignore[union-attr]
 
 
 def test_an_old_command_is_not_sent_again() -> None:

@@ -131,9 +131,10 @@ def test_a_unit_whose_monitoring_stops_is_told_silent_and_heard_again(setup: Set
     setup.until(lambda: "tractor-7 is heard again" in setup.said)
 
 
-def test_connections_are_told(setup: Setup) -> None:
+def test_connections_are_told_and_greeted(setup: Setup) -> None:
     message = wire.Connection(unit=UNIT, boot=1, seq=1, t=seconds(1), state="ONLINE", supervising=False, waiting=3)
     setup.publish("connection", wire.encode(message))
+    setup.until(lambda: [(ack.boot, ack.seq) for ack in setup.acks] == [(1, 0)])
     setup.until(lambda: "tractor-7 is ONLINE, its supervision is not running, 3 events to come" in setup.said)
 
 

@@ -8,11 +8,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from level1.event import Event, SentFrame, decode, seconds
+from level1.event import Commanded, Event, SentFrame, decode, decode_commanded, seconds
 from level1.io.journal import Journal
 from ucs.main import main
 
@@ -106,10 +108,35 @@ def test_csv_has_a_row_for_each_event(unit: Path, capsys: pytest.CaptureFixture[
 
 def test_nothing_to_show_is_told_apart_from_nothing_yet(unit: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["journal", str(unit), "--alarm", "Other"]) == 0
-    assert "no such event" in capsys.readouterr().err
+    assert "nothing of the kind" in capsys.readouterr().err
     Journal(tmp_path / "empty.db", "tractor-8").close()
     assert main(["journal", str(tmp_path / "empty.db")]) == 0
-    assert "no event yet" in capsys.readouterr().err
+    assert "nothing yet" in capsys.readouterr().err
+
+
+def test_commands_stand_among_the_events_with_what_was_sent(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def command(after: int, name: str, **more: Any) -> Commanded:
+        return Commanded("tractor-7", 2, after, seconds(after * 10**9), None, False, name, **{
+            "target": "", "value": None, "origin": "above", "by": "chief", "id": "c-17", "outcome": "done"} | more)
+
+    slower = command(0, "reduce_speed", value=Decimal("2.50"), frames=(SentFrame("VEHICLE_CMD", "100", "0019"),))
+    reset = command(1, "reset", target="PilotFlameOut", outcome="refused", reason="can only be reset at the machine", id="c-18")
+    with Journal(unit.with_name("second.db"), "tractor-7") as journal:
+        journal.append(EVENTS[:1], b"")
+    with Journal(unit.with_name("second.db"), "tractor-7") as journal:
+        journal.append([an_event(1, "BottleEmpty", "raised", boot=2)], b"", [slower, reset])
+    second = unit.with_name("second.db")
+    assert shown(capsys, second, "--values").splitlines()[2:] == [
+        "0.000 s  2  command  reduce_speed 2.50 by chief (c-17): done",
+        "    sent VEHICLE_CMD 100#0019",
+        "1.000 s  2.1  BottleEmpty  raised  Pilot flame out",
+        "    FLAMER_STATUS.PilotFlame = Off",
+        "1.000 s  2  command  reset PilotFlameOut by chief (c-18): refused: can only be reset at the machine"]
+    lines = shown(capsys, second, "--event", "command", "--format", "jsonl").splitlines()
+    assert [decode_commanded(line) for line in lines] == [slower, reset]
+    assert len(shown(capsys, second, "--alarm", "PilotFlameOut").splitlines()) == 2
+    row = list(csv.DictReader(io.StringIO(shown(capsys, second, "--format", "csv", "--event", "command"))))[0]
+    assert (row["event"], row["seq"], json.loads(row["frames"])[0]["id"]) == ("command", "0", "100")
 
 
 def test_following_shows_events_as_they_come(tmp_path: Path) -> None:
