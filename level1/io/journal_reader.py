@@ -74,7 +74,7 @@ class Reader:
         """The newest event of a kind of an alarm."""
         query = "SELECT line FROM event WHERE alarm = ? AND event = ? ORDER BY boot DESC, seq DESC LIMIT 1"
         rows = self._rows(query, (alarm, event))
-        return self._decoded(rows[0][0]) if rows else None
+        return self._decoded(rows[0][0], decode) if rows else None
 
     def state(self) -> bytes | None:
         """The supervisor's state as last written."""
