@@ -2,22 +2,19 @@
 from __future__ import annotations
 
 import gc
-import pickle
 import platform
-import subprocess
 import sys
-import tempfile
 from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import can
 import cantools
 
 from benchmarks import runs, workload
+from benchmarks.recordings import message_of
 from level1.catalog import Catalog
 from level1.definitions import Source, build
 from level1.frame import Frame
@@ -34,7 +31,7 @@ def main() -> int:
     print(machine())
     print(f"{len(load):,} frames of {len(load.messages)} messages in {load.seconds:.0f} s of driving, {load.repeated:.0%} repeat "
           f"the payload before them; {len(load.rules)} alarms")
-    return from_memory(load, args.rounds) or from_file(load, args.rounds)
+    return from_memory(load, args.rounds)
 
 
 def from_memory(load: workload.Workload, rounds: int) -> int:
@@ -67,34 +64,6 @@ def from_memory(load: workload.Workload, rounds: int) -> int:
     return 0
 
 
-def from_file(load: workload.Workload, rounds: int) -> int:
-    """The frames from a candump file, each contender in a process of its own."""
-    with tempfile.TemporaryDirectory() as folder:
-        log, dbc, rules = Path(folder, "drive.log"), Path(folder, "drive.dbc"), Path(folder, "rules.pickle")
-        log.write_text("".join(load.candump()))
-        dbc.write_text(workload.dbc(load))
-        rules.write_bytes(pickle.dumps(load.rules))
-        peaks: dict[str, float] = {}
-        digests: set[str] = set()
-
-        def run(contender: str) -> float:
-            command = [sys.executable, "-m", "benchmarks.chain", contender, str(log), str(dbc), str(rules)]
-            spent, peak_kb, digest = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
-            peaks[contender] = int(peak_kb) / 1000
-            digests.add(digest)
-            return float(spent)
-
-        seconds = in_turn({"core": lambda: run("core"), "peer": lambda: run("peer")}, rounds)
-    if len(digests) > 1:
-        print("the chains differ in their alarms", file=sys.stderr)
-        return 1
-    print(f"from a candump file, same alarms, median of {rounds} rounds in turn")
-    print_rate("core: its reader + receive_many", len(load), seconds["core"], f"{peaks['core']:6.0f} MB resident")
-    print_rate("peer: LogReader + cantools + rules", len(load), seconds["peer"], f"{peaks['peer']:6.0f} MB resident")
-    print(f"chain ratio: {seconds['peer'] / seconds['core']:.1f}")
-    return 0
-
-
 def in_turn(contenders: dict[str, Callable[[], float]], rounds: int) -> dict[str, float]:
     """Median CPU seconds of each; they take turns, so that a busy moment of the machine hits them alike."""
     spent: dict[str, list[float]] = {name: [] for name in contenders}
@@ -114,13 +83,12 @@ def catalog_of(load: workload.Workload) -> Catalog:
 
 def messages_of(frames: Sequence[Frame]) -> list[can.Message]:
     """The same frames as python-can hands them out."""
-    return [can.Message(timestamp=frame.t_ns / 1e9, arbitration_id=frame.can_id, is_extended_id=frame.extended, data=frame.data)
-            for frame in frames]
+    return [message_of(frame) for frame in frames]
 
 
-def print_rate(name: str, frames: int, seconds: float, more: Any = "") -> None:
+def print_rate(name: str, frames: int, seconds: float) -> None:
     """One line of the table."""
-    print(f"  {name:<36}{frames / seconds:>12,.0f} frames/s {seconds / frames * 1e9:>7.0f} ns/frame  {more}".rstrip())
+    print(f"  {name:<36}{frames / seconds:>12,.0f} frames/s {seconds / frames * 1e9:>7.0f} ns/frame")
 
 
 def machine() -> str:

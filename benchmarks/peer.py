@@ -27,11 +27,12 @@ class Deadline(Protocol):
 
 
 class Condition:
-    """A rule with an on-delay and an off-delay."""
+    """A rule with an on-delay and an off-delay. signals: what it reads."""
 
-    def __init__(self, monitor: Monitor, name: str, on_ms: int, off_ms: int):
+    def __init__(self, monitor: Monitor, name: str, signals: tuple[str, ...], on_ms: int, off_ms: int):
         self.monitor = monitor
         self.name = name
+        self.signals = signals
         self.on_ns = on_ms * 1_000_000
         self.off_ns = off_ms * 1_000_000
         self.active = False
@@ -76,7 +77,7 @@ class HighValue(Condition):
     """A value above one limit, until it is below another."""
 
     def __init__(self, monitor: Monitor, rule: Threshold):
-        super().__init__(monitor, rule.name, rule.on_ms, rule.off_ms)
+        super().__init__(monitor, rule.name, (rule.signal,), rule.on_ms, rule.off_ms)
         self.signal, self.high, self.low = rule.signal, float(rule.high), float(rule.low)
 
     def wants_change(self, values: Mapping[str, float]) -> bool:
@@ -88,7 +89,7 @@ class LargeDeviation(Condition):
     """Two values that differ by more than one limit, until they do by less than another."""
 
     def __init__(self, monitor: Monitor, rule: Deviation):
-        super().__init__(monitor, rule.name, rule.on_ms, rule.off_ms)
+        super().__init__(monitor, rule.name, rule.signals, rule.on_ms, rule.off_ms)
         self.one, self.other = rule.signals
         self.high, self.low = float(rule.high), float(rule.low)
 
@@ -101,7 +102,7 @@ class EqualValue(Condition):
     """A value that is a certain one."""
 
     def __init__(self, monitor: Monitor, rule: Equality):
-        super().__init__(monitor, rule.name, rule.on_ms, rule.off_ms)
+        super().__init__(monitor, rule.name, (rule.signal,), rule.on_ms, rule.off_ms)
         self.signal, self.value = rule.signal, rule.value
 
     def wants_change(self, values: Mapping[str, float]) -> bool:
@@ -199,11 +200,25 @@ class Monitor:
                         conditions[name].append(deviation)
                 case Silence():
                     watchdogs[rule.message].append(SilentMessage(self, rule))
+        self._branches: dict[int, tuple[str, dict[int, StaleValues]]] = {}
         for message in database.messages:
-            names = [signal.name for signal in message.signals]
-            watchdogs[message.name].append(StaleValues(self, message.cycle_time, names, conditions[message.name]))
+            always = [signal.name for signal in message.signals if not signal.multiplexer_ids]
+            watchdogs[message.name].append(self._stale_values(message.cycle_time, always, conditions[message.name]))
+            branches: dict[int, list[str]] = {}
+            for signal in message.signals:
+                for branch in signal.multiplexer_ids or ():
+                    branches.setdefault(branch, []).append(signal.name)
+            if branches:
+                selector = next(signal.name for signal in message.signals if signal.is_multiplexer)
+                self._branches[message.frame_id] = selector, {
+                    branch: self._stale_values(message.cycle_time * len(branches), names, conditions[message.name])
+                    for branch, names in branches.items()}
         self._conditions = {message.frame_id: conditions[message.name] for message in database.messages}
         self._watchdogs = {message.frame_id: watchdogs[message.name] for message in database.messages}
+
+    def _stale_values(self, cycle_ms: int, names: Sequence[str], conditions: Sequence[Condition]) -> StaleValues:
+        """The watchdog of some signals that come together, each cycle."""
+        return StaleValues(self, cycle_ms, names, [each for each in conditions if not set(each.signals).isdisjoint(names)])
 
     def receive(self, message: can.Message) -> None:
         """One message from the bus."""
@@ -213,7 +228,11 @@ class Monitor:
             if item.due_ns == due_ns:
                 item.expire(due_ns)
         frame_id = message.arbitration_id
-        self.values.update(self.database.decode_message(frame_id, message.data, decode_choices=False))
+        decoded = self.database.decode_message(frame_id, message.data, decode_choices=False)
+        self.values.update(decoded)
+        if frame_id in self._branches:
+            selector, branches = self._branches[frame_id]
+            branches[decoded[selector]].feed(t_ns)
         for watchdog in self._watchdogs[frame_id]:
             watchdog.feed(t_ns)
         for condition in self._conditions[frame_id]:

@@ -12,7 +12,6 @@ from benchmarks.rules import Rule
 from level1.catalog import Catalog
 from level1.event import Event
 from level1.frame import Frame
-from level1.io.replay import Log
 from level1.supervisor import Supervisor
 
 AlarmLine = tuple[int, str, str]
@@ -63,23 +62,3 @@ def decoding_alone(database: Any, messages: Sequence[can.Message]) -> float:
     for message in messages:
         database.decode_message(message.arbitration_id, message.data, decode_choices=False)
     return time.process_time() - start
-
-
-def chain_core(catalog: Catalog, path: str) -> tuple[float, list[AlarmLine]]:
-    """From a candump file through the core, as `ucs replay` does it."""
-    core = supervisor(catalog)
-    outputs: list[object] = []
-    start = time.process_time()
-    for batch in Log(path, one_bus=True).batches():
-        outputs += core.receive_many(batch)
-    return time.process_time() - start, alarms_of(outputs)
-
-
-def chain_peer(database: Any, rules: Sequence[Rule], path: str) -> tuple[float, list[AlarmLine]]:
-    """From a candump file through python-can's reader and the peer."""
-    monitor = Monitor(database, rules)
-    start = time.process_time()
-    with can.LogReader(path) as reader:
-        for message in reader:
-            monitor.receive(message)
-    return time.process_time() - start, monitor.alarms

@@ -5,6 +5,9 @@
 them. Every message falls silent now and then. 160 alarms: thresholds with hysteresis and delays (one on every message),
 deviations between two messages, equality with a named value, time-outs.
 
+A *mixed* recording has 12 messages more, an eighth of its frames: of odd lengths from 1 to 7 bytes, CAN FD of 12, 24 and 64
+bytes, and multiplexed ones whose four branches come in turn, with alarms on each branch.
+
 Every limit lies between two raw values, so that no rounding, the core's or another program's, decides about an alarm.
 """
 from __future__ import annotations
@@ -36,13 +39,24 @@ STAMP_JITTER_US = 200
 DEVIATIONS, EQUALITIES = 15, 25
 ALARM_ID = 0x700
 """Identifier of the first message that carries alarms, 32 in each."""
+WORD_BYTES = 8
+BRANCHES = 4
+"""Of a multiplexed message; its selector counts through them."""
+SELECTOR_BITS = 4
+BRANCH_LAYOUT = (12, 16, 16, 8, 4, 4)
+"""What stands behind the selector in each branch."""
+OTHERS = ((1, 50, (8,)), (3, 20, (16, 8)), (5, 50, (16, 12, 8, 4)), (6, 100, (32, 16)), (7, 50, (16, 16, 12, 8, 4)),
+          (8, 50, ()), (8, 50, ()), (8, 100, ()), (12, 100, (16, 16, 16, 16, 16, 16)),
+          (24, 20, LAYOUTS[0] + LAYOUTS[2] + LAYOUTS[5]), (64, 50, sum(LAYOUTS, ())), (64, 100, sum(LAYOUTS, ())))
+"""Messages of a mixed recording besides the others: bytes, cycle in ms, signal widths (none: multiplexed)."""
 
 Raw = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Signal:
-    """A signal. position: bits before it, counted in the message's own byte order. named: has a value table instead of a scale."""
+    """A signal. position: bits before it, counted in the message's own byte order. named: has a value table instead of a scale.
+    branch: value of the selector with which it comes, None for every frame; is_selector: it is the selector."""
 
     name: str
     position: int
@@ -51,6 +65,13 @@ class Signal:
     named: bool
     factor: Decimal
     offset: Decimal
+    branch: int | None = None
+    is_selector: bool = False
+
+    @property
+    def rows(self) -> slice:
+        """Which frames of its message carry it."""
+        return slice(None) if self.branch is None else slice(self.branch, None, BRANCHES)
 
     @property
     def raw_range(self) -> tuple[int, int]:
@@ -61,7 +82,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Message:
-    """A message of 8 bytes."""
+    """A message of `size` bytes: CAN FD when they are more than 8."""
 
     name: str
     can_id: int
@@ -70,6 +91,17 @@ class Message:
     cycle_ms: int
     change_share: float
     signals: tuple[Signal, ...]
+    size: int = WORD_BYTES
+
+    @property
+    def slowest_ms(self) -> int:
+        """Time from one frame to the next that carries the same signals."""
+        return self.cycle_ms * (BRANCHES if any(signal.is_selector for signal in self.signals) else 1)
+
+    @property
+    def is_fd(self) -> bool:
+        """Whether only CAN FD can carry it."""
+        return self.size > WORD_BYTES
 
     @property
     def dbc_id(self) -> int:
@@ -79,7 +111,7 @@ class Message:
 
 @dataclass(frozen=True)
 class Workload:
-    """Definitions and recording. t_us: time stamps from the start, sender: index of the message, payload: its 8 bytes."""
+    """Definitions and recording. t_us: time stamps from the start, sender: index of the message, payload: all bytes in a row."""
 
     messages: tuple[Message, ...]
     rules: tuple[Rule, ...]
@@ -93,15 +125,19 @@ class Workload:
     def frames(self) -> Iterator[Frame]:
         """The recording as the core reads it."""
         keys = [frame_key(message.can_id, message.extended) for message in self.messages]
-        for i, (t_us, sender) in enumerate(zip(self.t_us.tolist(), self.sender.tolist(), strict=True)):
-            yield Frame(EPOCH_NS + t_us * 1000, keys[sender], self.payload[8 * i:8 * i + 8])
+        sizes = [message.size for message in self.messages]
+        begin = 0
+        for t_us, sender in zip(self.t_us.tolist(), self.sender.tolist(), strict=True):
+            end = begin + sizes[sender]
+            yield Frame(EPOCH_NS + t_us * 1000, keys[sender], self.payload[begin:end])
+            begin = end
 
     def candump(self) -> Iterator[str]:
         """The recording as `candump -L` writes it, line by line."""
-        names = [f"{message.can_id:0{8 if message.extended else 3}X}" for message in self.messages]
+        names = [f"{message.can_id:0{8 if message.extended else 3}X}#{'#1' if message.is_fd else ''}" for message in self.messages]
         for frame, sender in zip(self.frames(), self.sender.tolist(), strict=True):
             seconds, rest = divmod(frame.t_ns, 10**9)
-            yield f"({seconds}.{rest // 1000:06d}) can0 {names[sender]}#{frame.data.hex().upper()}\n"
+            yield f"({seconds}.{rest // 1000:06d}) can0 {names[sender]}{frame.data.hex().upper()}\n"
 
     @property
     def seconds(self) -> float:
@@ -119,10 +155,12 @@ class Workload:
         return same / len(self)
 
 
-def make(frames: int, seed: int = SEED) -> Workload:
+def make(frames: int, seed: int = SEED, *, mixed: bool = False) -> Workload:
     """The workload of about so many frames: a few less, because messages fall silent."""
     random = np.random.default_rng(seed)
     messages = _messages(random)
+    if mixed:
+        messages += tuple(_others(random, messages))
     seconds = frames / sum(1000 / message.cycle_ms for message in messages)
     raws: dict[str, Raw] = {}
     stamps, payloads = [], []
@@ -131,11 +169,11 @@ def make(frames: int, seed: int = SEED) -> Workload:
         raws |= _values(random, message, len(t_us))
         heard = _heard(random, message, t_us, seconds)
         stamps.append(t_us[heard])
-        payloads.append(_pack(message, raws)[heard])
+        payloads.append(_pack(message, raws, len(t_us))[heard])
     order = np.argsort(np.concatenate(stamps), kind="stable")
-    sender = np.repeat(np.arange(len(messages)), [len(t_us) for t_us in stamps])
-    return Workload(messages, tuple(_rules(random, messages, raws)), np.concatenate(stamps)[order], sender[order],
-                    np.concatenate(payloads)[order].tobytes())
+    sender = np.repeat(np.arange(len(messages)), [len(t_us) for t_us in stamps])[order]
+    return Workload(messages, tuple(_rules(random, messages, raws)), np.concatenate(stamps)[order], sender,
+                    _in_a_row(payloads, order, sender))
 
 
 def dbc(workload: Workload) -> str:
@@ -155,17 +193,35 @@ def _messages(random: np.random.Generator) -> tuple[Message, ...]:
     for i in range(len(CYCLES_MS)):
         extended = i % 3 != 0
         can_id = 0x1800_0000 | next(groups) << 8 | int(random.integers(250)) if extended else next(standard)
-        position = 0
-        signals = []
-        for k, length in enumerate(LAYOUTS[i % len(LAYOUTS)]):
-            named = length <= 4
-            factor, offset = (Decimal(1), Decimal(0)) if named else (FACTORS[random.integers(len(FACTORS))],
-                                                                     OFFSETS[random.integers(len(OFFSETS))])
-            signals.append(Signal(f"M{i:02d}S{k}", position, length, length >= 8 and random.random() < 0.25, named, factor, offset))
-            position += length
+        signals = tuple(_laid_out(random, f"M{i:02d}S", LAYOUTS[i % len(LAYOUTS)], 0, None))
         messages.append(Message(f"MSG{i:02d}", can_id, extended, i % 4 == 3, CYCLES_MS[places[i]],
-                                CHANGE_SHARES[places[i] % len(CHANGE_SHARES)], tuple(signals)))
+                                CHANGE_SHARES[places[i] % len(CHANGE_SHARES)], signals))
     return tuple(messages)
+
+
+def _others(random: np.random.Generator, messages: Sequence[Message]) -> Iterator[Message]:
+    """The messages that only a mixed recording has; `OTHERS`."""
+    taken = {message.can_id for message in messages}
+    free = iter([can_id for can_id in range(0x100, 0x6F0) if can_id not in taken])
+    for i, (size, cycle_ms, layout) in enumerate(OTHERS, len(messages)):
+        extended = i % 2 == 1
+        can_id = 0x1CFF_0000 | i << 8 | 0x21 if extended else next(free)
+        if layout:
+            signals = tuple(_laid_out(random, f"M{i:02d}S", layout, 0, None))
+        else:
+            selector = Signal(f"M{i:02d}Turn", 0, SELECTOR_BITS, False, False, Decimal(1), Decimal(0), is_selector=True)
+            signals = (selector, *(signal for branch in range(BRANCHES) for signal in _laid_out(
+                random, f"M{i:02d}B{branch}S", BRANCH_LAYOUT, SELECTOR_BITS, branch)))
+        yield Message(f"MSG{i:02d}", can_id, extended, False, cycle_ms, CHANGE_SHARES[i % len(CHANGE_SHARES)], signals, size)
+
+
+def _laid_out(random: np.random.Generator, name: str, layout: Sequence[int], position: int, branch: int | None) -> Iterator[Signal]:
+    for k, length in enumerate(layout):
+        named = length <= 4
+        factor, offset = (Decimal(1), Decimal(0)) if named else (FACTORS[random.integers(len(FACTORS))],
+                                                                 OFFSETS[random.integers(len(OFFSETS))])
+        yield Signal(f"{name}{k}", position, length, length >= 8 and random.random() < 0.25, named, factor, offset, branch)
+        position += length
 
 
 def _stamps(random: np.random.Generator, message: Message, seconds: float) -> Raw:
@@ -186,30 +242,49 @@ def _heard(random: np.random.Generator, message: Message, t_us: Raw, seconds: fl
 
 
 def _values(random: np.random.Generator, message: Message, count: int) -> dict[str, Raw]:
-    """Raw values of each signal: named ones jump seldom, the others walk at random between their ends."""
+    """Raw values of each signal: named ones jump seldom, the others walk at random between their ends, a selector counts."""
     changes = random.random(count) < message.change_share
     raws = {}
     for signal in message.signals:
         span = 1 << signal.length
+        if signal.is_selector:
+            raws[signal.name] = np.arange(count) % BRANCHES
+            continue
+        own = changes[signal.rows]
         if signal.named:
-            jumps = random.integers(1, span, count) * (changes & (random.random(count) < 0.01))
+            jumps = random.integers(1, span, len(own)) * (own & (random.random(len(own)) < 0.01))
             raws[signal.name] = (random.integers(span) + jumps.cumsum()) % span
             continue
         step = max(1, span // 400)
-        steps = random.integers(-step, step + 1, count) * (changes & (random.random(count) < 0.6))
+        steps = random.integers(-step, step + 1, len(own)) * (own & (random.random(len(own)) < 0.6))
         walk = random.integers(span) + steps.cumsum()
         folded = np.abs((walk + span) % (2 * span) - span)
         raws[signal.name] = np.minimum(folded, span - 1) - (span // 2 if signal.signed else 0)
     return raws
 
 
-def _pack(message: Message, raws: dict[str, Raw]) -> npt.NDArray[np.uint8]:
-    """Payloads, one row of 8 bytes for each frame."""
-    words = np.zeros(len(raws[message.signals[0].name]), np.uint64)
+def _pack(message: Message, raws: dict[str, Raw], count: int) -> npt.NDArray[np.uint8]:
+    """Payloads, one row for each of so many frames. No signal reaches from one eight bytes into the next."""
+    words = np.zeros((count, -(-message.size // WORD_BYTES)), np.uint64)
     for signal in message.signals:
-        shift = 64 - signal.position - signal.length if message.motorola else signal.position
-        words |= (raws[signal.name] & (1 << signal.length) - 1).astype(np.uint64) << np.uint64(shift)
-    return words.astype(">u8" if message.motorola else "<u8").view(np.uint8).reshape(-1, 8)
+        word, position = divmod(signal.position, 64)
+        shift = 64 - position - signal.length if message.motorola else position
+        words[signal.rows, word] |= (raws[signal.name] & (1 << signal.length) - 1).astype(np.uint64) << np.uint64(shift)
+    return words.astype(">u8" if message.motorola else "<u8").view(np.uint8)[:, :message.size]
+
+
+def _in_a_row(payloads: Sequence[npt.NDArray[np.uint8]], order: Raw, sender: Raw) -> bytes:
+    """The payloads of all messages in the order of the recording, one directly behind the other."""
+    sizes = np.array([each.shape[1] for each in payloads])[sender]
+    ends = np.cumsum(sizes)
+    begins = np.empty_like(ends)
+    begins[order] = ends - sizes
+    out = np.empty(int(ends[-1]), np.uint8)
+    first = 0
+    for each in payloads:
+        out[begins[first:first + len(each), None] + np.arange(each.shape[1])] = each
+        first += len(each)
+    return out.tobytes()
 
 
 # --- rules ----------------------------------------------------------------------------------------------------------------
@@ -217,16 +292,13 @@ def _pack(message: Message, raws: dict[str, Raw]) -> npt.NDArray[np.uint8]:
 
 def _rules(random: np.random.Generator, messages: Sequence[Message], raws: dict[str, Raw]) -> Iterator[Rule]:
     """Limits are quantiles of what the recording holds, so that alarms come now and then and go again."""
-    scaled = [(message, signal) for message in messages for signal in message.signals if not signal.named]
+    scaled = [(message, signal) for message in messages for signal in message.signals if not (signal.named or signal.is_selector)]
     for i, message in enumerate(messages):
-        own = [signal for owner, signal in scaled if owner is message]
-        signal = own[random.integers(len(own))]
-        top = signal.raw_range[1]
-        low, high = (int(raw) for raw in np.quantile(raws[signal.name], (0.90, 0.97)))
-        low = min(low, top - 2)
-        high = min(max(high, low + 1), top - 1)
-        on_ms, off_ms = (_delay(ms, message) for ms in random.choice((0, 0, 100, 500, 2000), 2).tolist())
-        yield Threshold(f"High{i:02d}", message.name, signal.name, _between(signal, high), _between(signal, low), on_ms, off_ms)
+        for branch in sorted({signal.branch for owner, signal in scaled if owner is message}, key=str):
+            own = [signal for owner, signal in scaled if owner is message and signal.branch == branch]
+            signal = own[random.integers(len(own))]
+            name = f"High{i:02d}" if branch is None else f"High{i:02d}B{branch}"
+            yield _threshold(name, message, signal, raws[signal.name], random.choice((0, 0, 100, 500, 2000), 2).tolist())
     for i in range(DEVIATIONS):
         one = scaled[random.integers(len(scaled))]
         other = one
@@ -243,9 +315,18 @@ def _rules(random: np.random.Generator, messages: Sequence[Message], raws: dict[
         yield Silence(f"Silent{i:02d}", message.name, max(50, 5 * message.cycle_ms))
 
 
+def _threshold(name: str, message: Message, signal: Signal, raws: Raw, delays_ms: Sequence[int]) -> Threshold:
+    top = signal.raw_range[1]
+    low, high = (int(raw) for raw in np.quantile(raws, (0.90, 0.97)))
+    low = min(low, top - 2)
+    high = min(max(high, low + 1), top - 1)
+    on_ms, off_ms = (_delay(ms, message) for ms in delays_ms)
+    return Threshold(name, message.name, signal.name, _between(signal, high), _between(signal, low), on_ms, off_ms)
+
+
 def _delay(wanted_ms: int, *messages: Message) -> int:
     """A delay that more than one frame decides about: at least two cycles."""
-    return max(wanted_ms, *(2 * message.cycle_ms for message in messages)) if wanted_ms else 0
+    return max(wanted_ms, *(2 * message.slowest_ms for message in messages)) if wanted_ms else 0
 
 
 def _between(signal: Signal, raw: int) -> Decimal:
@@ -279,6 +360,8 @@ def _common_step(numbers: Sequence[Decimal]) -> Decimal:
 _HEAD = ('VERSION ""', "", "NS_ :", "", "BS_:", "", "BU_: ECU UCS", "")
 _ATTRIBUTES = (
     'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 3600000;',
+    'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG","reserved","reserved","reserved","reserved",'
+    '"reserved","reserved","reserved","reserved","reserved","reserved","StandardCAN_FD","ExtendedCAN_FD";',
     'BA_DEF_ SG_ "AlarmCode" INT 0 65535;',
     'BA_DEF_ SG_ "AlarmPriority" ENUM "Event","Low","Medium","High","Critical";',
     'BA_DEF_ SG_ "AlarmWhen" STRING;',
@@ -286,6 +369,7 @@ _ATTRIBUTES = (
     'BA_DEF_ SG_ "AlarmOnDelay" INT 0 86400000;',
     'BA_DEF_ SG_ "AlarmOffDelay" INT 0 86400000;',
     'BA_DEF_DEF_ "GenMsgCycleTime" 0;',
+    'BA_DEF_DEF_ "VFrameFormat" "StandardCAN";',
     'BA_DEF_DEF_ "AlarmCode" 0;',
     'BA_DEF_DEF_ "AlarmPriority" "Medium";',
     'BA_DEF_DEF_ "AlarmWhen" "";',
@@ -297,12 +381,14 @@ _ATTRIBUTES = (
 
 def _dbc_messages(workload: Workload) -> Iterator[str]:
     for message in workload.messages:
-        yield f"BO_ {message.dbc_id} {message.name}: 8 ECU"
+        yield f"BO_ {message.dbc_id} {message.name}: {message.size} ECU"
         for signal in message.signals:
             position = signal.position
             start = position // 8 * 8 + 7 - position % 8 if message.motorola else position
             limits = "|".join(f"{raw * signal.factor + signal.offset:f}" for raw in signal.raw_range)
-            yield (f" SG_ {signal.name} : {start}|{signal.length}@{0 if message.motorola else 1}{'-' if signal.signed else '+'} "
+            role = " M" if signal.is_selector else "" if signal.branch is None else f" m{signal.branch}"
+            order = 0 if message.motorola else 1
+            yield (f" SG_ {signal.name}{role} : {start}|{signal.length}@{order}{'-' if signal.signed else '+'} "
                    f'({signal.factor:f},{signal.offset:f}) [{limits}] "" UCS')
         yield ""
     for number, names in enumerate(_alarm_messages(workload.rules)):
@@ -320,6 +406,8 @@ def _alarm_messages(rules: Sequence[Rule]) -> list[list[str]]:
 def _dbc_cycles(workload: Workload) -> Iterator[str]:
     for message in workload.messages:
         yield f'BA_ "GenMsgCycleTime" BO_ {message.dbc_id} {message.cycle_ms};'
+        if message.is_fd:
+            yield f'BA_ "VFrameFormat" BO_ {message.dbc_id} {15 if message.extended else 14};'
     for number in range(len(_alarm_messages(workload.rules))):
         yield f'BA_ "GenMsgCycleTime" BO_ {ALARM_ID + number} 1000;'
 
