@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -54,7 +55,7 @@ program = "ultrasonic_sensors"
 [nodes.mission]
 program = "airblast_mission"
 """
-SPRAYER, SENSORS, UNKNOWN = 42, 43, 7
+SPRAYER, SENSORS, UNKNOWN, GUARDED = 42, 43, 7, 11
 Start = Callable[..., Process]
 
 
@@ -167,6 +168,59 @@ def test_emergencies_and_error_history_of_a_node_by_the_package(run: Process, pe
     assert raised["values"]["ErrorRegister"] == "generic, voltage"
     assert raised["values"]["MakerBytes"] == "0102030405"
     assert cleared["values"]["ErrorHistory"] == "0x3120 0x8130", "read by SDO from the node"
+
+
+class Guarded:
+    """A device that only answers guarding: by the frames of CiA 301 alone, as the package's own nodes answer no remote frame."""
+
+    def __init__(self) -> None:
+        self.alternates = True
+        self.asked = 0
+        self._toggle = 0
+        self._bus = can.Bus(channel="vcan0", interface="socketcan", can_filters=[{"can_id": 0x700 + GUARDED, "can_mask": 0x7FF}])
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._answer)
+        self._thread.start()
+
+    def _answer(self) -> None:
+        while not self._ended.is_set():
+            question = self._bus.recv(0.1)
+            if question is not None and question.is_remote_frame and question.dlc == 1:
+                self.asked += 1
+                self._bus.send(can.Message(arbitration_id=0x700 + GUARDED, is_extended_id=False, data=[5 | self._toggle]))
+                self._toggle ^= 0x80 if self.alternates else 0
+
+    def stop(self) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._bus.shutdown()
+
+
+def test_a_guarded_device_is_asked_and_told_by_the_name_of_its_data_sheet_when_it_does_not_answer(
+        process: Start, tmp_path: Path) -> None:
+    (tmp_path / "valve.eds").write_text("[DeviceInfo]\nProductName=Old valve\n[100C]\nDefaultValue=100\n[100D]\nDefaultValue=8\n")
+    (tmp_path / "unit.toml").write_text(
+        UNIT.replace("[repairs]", f'[[bus.canopen]]\nnode = {GUARDED}\neds = "valve.eds"\n[repairs]'))
+    started = process("run", "unit.toml")
+    started.expect("; supervising$", START_S)
+    device = Guarded()
+    try:
+        while device.asked < 20:
+            time.sleep(0.1)
+    finally:
+        device.stop()
+    started.expect(f"DeviceSilent +raised.*Node {GUARDED}, Device Old valve", SLOW_S)
+    device = Guarded()
+    try:
+        started.expect("DeviceSilent +cleared", SLOW_S)
+        device.alternates = False
+        started.expect("DeviceSilent +raised", SLOW_S)
+    finally:
+        device.stop()
+    assert started.stop() == 0
+    assert [event["text"] for event in journal(tmp_path, "DeviceSilent") if event["event"] == "raised"] == [
+        f"Old valve (node {GUARDED}): no answer to guarding for 0.85 s",
+        f"Old valve (node {GUARDED}): no right answer to guarding (its toggle bit stands still) for 0.85 s"]
 
 
 def test_a_node_nobody_configured_is_learned_and_missed(run: Process, peer: Peer) -> None:

@@ -43,6 +43,8 @@ MAX_KEYS = 65_536
 MAX_ROUNDS = 64
 """Rounds of evaluation at one instant before conditions that feed each other are left for the next input."""
 
+Listener = Callable[[int, int, bytes], None]
+"""listener(t_ns, key, data): told of every frame."""
 _index = attrgetter("index")
 
 
@@ -260,7 +262,7 @@ class Tap:
 
     __slots__ = ("always", "data", "handle", "seen", "t_ns")
 
-    def __init__(self, key: int, listen: Callable[[int, int, bytes], None], page: Page | None):
+    def __init__(self, key: int, listen: Listener, page: Page | Tap | None):
         self.always = True
         self.data = b""
         self.t_ns = 0
@@ -373,9 +375,9 @@ class Board:
         self.pages: dict[str, Page] = {}
         self.branches: dict[tuple[str, str, tuple[int, ...]], Page] = {}
         self.table: dict[int, Page | Tap | None] = {}
-        self.listeners: dict[int, Callable[[int, int, bytes], None]] = {}
-        self.identifiers: dict[int, Callable[[int, int, bytes], None]] = {}
-        self.newcomer: Callable[[int], None] = _unnoticed
+        self.listeners: dict[int, Listener] = {}
+        self.identifiers: dict[int, Listener] = {}
+        self.newcomer: Callable[[int], Listener | None] = _unnoticed
         self.queued: list[Cell] = []
         self.watches = 0
         self.refresh: Callable[[Page], None] = _as_it_is
@@ -499,15 +501,15 @@ class Board:
 
     # --- running ----------------------------------------------------------------------------------------------------------
 
-    def listen(self, pgn: int, listener: Callable[[int, int, bytes], None]) -> None:
+    def listen(self, pgn: int, listener: Listener) -> None:
         """Have listener(t_ns, key, data) called for every frame of a J1939 parameter group."""
         self.listeners[pgn] = listener
 
-    def listen_to(self, can_id: int, listener: Callable[[int, int, bytes], None]) -> None:
+    def listen_to(self, can_id: int, listener: Listener) -> None:
         """The same for every data frame of an 11-bit identifier, on any bus."""
         self.identifiers[can_id] = listener
 
-    def listener(self, key: int) -> Callable[[int, int, bytes], None] | None:
+    def listener(self, key: int) -> Listener | None:
         """Who listens to all data frames of an identifier, besides its page."""
         if key & (REMOTE | ERROR_FRAME):
             return None
@@ -525,11 +527,11 @@ class Board:
         A J1939 message with any source address belongs to the first source that sends it, until that one falls silent:
         two sources that alternate must not make its values flap.
         """
-        self.newcomer(key)
+        stranger = self.newcomer(key)
         page: Page | Tap | None = self._find(key)
-        listener = self.listener(key)
-        if listener is not None:
-            page = Tap(key, listener, page if isinstance(page, Page) else None)
+        for listener in (self.listener(key), stranger):
+            if listener is not None:
+                page = Tap(key, listener, page)
         if page is None:
             self.counters["ids nobody asks for"] += 1
             if len(self.table) >= MAX_KEYS:
@@ -537,6 +539,11 @@ class Board:
                     del self.table[nobodys]
         self.table[key] = page
         return page
+
+    def unbind(self, bus: int, source: int) -> None:
+        """Have what comes from a J1939 address met anew."""
+        for key in [key for key in self.table if key & EXTENDED and key & 0xFF == source and key >> BUS_SHIFT == bus]:
+            del self.table[key]
 
     def _find(self, key: int) -> Page | None:
         page = self.fixed_page(key)
@@ -673,5 +680,5 @@ class Board:
         return raw_of(cell.signal, page.data), cell.quality
 
 
-def _unnoticed(key: int) -> None:
+def _unnoticed(key: int) -> Listener | None:
     return None

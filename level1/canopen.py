@@ -1,7 +1,8 @@
-"""CANopen devices as level 1 sees them (CiA 301): heartbeat, boot-up, NMT commands, emergencies, error history.
+"""CANopen devices as level 1 sees them (CiA 301): heartbeat, node guarding, boot-up, NMT commands, emergencies, error history.
 
-Pure and passive: it listens, commands nobody and asks nobody; time comes with frames and deadlines. What it finds becomes causes
-of two alarms of `ucs.dbc`: each emergency one of `DeviceEmergency`, each lost heartbeat one of `DeviceSilent`.
+Pure: time comes with frames and deadlines. It commands nobody; the only thing it sends is the question of node guarding. What it
+finds becomes causes of two alarms of `ucs.dbc`: each emergency one of `DeviceEmergency`, each device that is not heard any more
+one of `DeviceSilent`.
 
 Theory of operation. A device is known from the configuration, or from its first boot-up or heartbeat: an implement may be coupled
 while the program runs. From then on its heartbeat must come:
@@ -9,6 +10,11 @@ while the program runs. From then on its heartbeat must come:
     unknown ──boot-up, heartbeat──▶ heard ──nothing for `MARGIN` heartbeat times──▶ silent ──boot-up, heartbeat──▶ heard
 
 - The heartbeat time is the configured one, else that of the EDS, else learned: the longest gap between the first heartbeats.
+- A device that is guarded instead is asked for its state, by a remote frame, every guard time, whether it is there or not: it may
+  be coupled at any time. It is silent when no right answer has come for its life time, guard time × life time factor, and half a
+  guard time in which the last answer may be late. In right answers the highest bit alternates (CiA 301 §7.2.8.3.2.2.1): one with
+  the bit of the answer before is none, so that a device whose program is dead is silent though its controller answers. After a
+  question without an answer either bit is right: it may be the question that was lost, or the answer.
 - After a command to reset, the device has `BOOT_NS` to come back. A device that sends no heartbeat is not missed.
 - An emergency stays until the device says that it is over (error code 0x00xx) or has booted: both forget all its errors. When the
   error register that comes with 0x00xx still has bits set, only the errors are over whose own bit is not among them.
@@ -28,7 +34,8 @@ from typing import Any, Protocol
 import msgspec
 
 from level1.catalog import Catalog, Message
-from level1.frame import BUS_SHIFT
+from level1.event import Send
+from level1.frame import BUS_SHIFT, REMOTE, frame_key
 from level1.timer import FAR, Timers
 
 DEVICE_EMERGENCY, DEVICE_SILENT = "DeviceEmergency", "DeviceSilent"
@@ -38,7 +45,13 @@ NODES = range(1, 128)
 MARGIN = Fraction(7, 2)
 """Heartbeat times without a heartbeat that make a device silent: two frames may be lost, and the third be late."""
 SHORTEST_NS = 300_000_000
-"""Silence that is never told: heartbeats of 100 ms and less may come as late as that."""
+"""Silence that is never told: heartbeats of 100 ms and less may come as late as that, and so may answers."""
+LIFE_FACTOR = 3
+"""Life time factor of a guarded device for which none is given."""
+TOGGLE = 0x80
+"""The bit that alternates in the answers of a guarded device."""
+STAGGER_NS = 1_000_000
+"""The first questions come this far apart by node id, so that not all are asked at once."""
 LONGEST_LEARNED_NS = 65_535_000_000
 """Longest heartbeat time that object 0x1017 can hold."""
 LEARN = 3
@@ -81,6 +94,7 @@ class Device(msgspec.Struct, frozen=True):
 
     bus: its index. node: 1 to 127. heartbeat_ns: its heartbeat time, None: learned; 0: it has none and is not missed.
     required: it is missed also when it was never heard; else only from its first sign of life on. errors: texts by error code.
+    guard_ns: it is guarded, and asked so often; life_factor: times that without a right answer make it silent.
     """
 
     bus: int
@@ -89,6 +103,8 @@ class Device(msgspec.Struct, frozen=True):
     heartbeat_ns: int | None = None
     required: bool = False
     errors: dict[int, str] = {}
+    guard_ns: int | None = None
+    life_factor: int = LIFE_FACTOR
 
 
 class Host(Protocol):
@@ -99,6 +115,9 @@ class Host(Protocol):
 
     def causes(self, alarm: str) -> Mapping[str, dict[str, Any]]:
         """The causes of an alarm that are there, by key, with their details."""
+
+    def hand_out(self, send: Send) -> None:
+        """Send a frame of a protocol, through the gate."""
 
 
 class Emergency(msgspec.Struct, frozen=True):
@@ -144,15 +163,22 @@ def outlives(code: int, register: int) -> bool:
 
 
 class _Node:
-    """A device that was heard or is waited for. heartbeat_ns: None while unknown; gaps: what it is learned from."""
+    """A device that was heard or is waited for. heartbeat_ns: None while unknown; gaps: what it is learned from. guard_ns, life_ns:
+    guard time and life time of a guarded one, else 0. toggle: highest bit of its last answer, None: either is right next;
+    answered_ns: when that came. stuck: its answers do not alternate any more."""
 
-    __slots__ = ("_devices", "boots_ns", "bus", "due", "gaps", "heard", "heartbeat_ns", "history", "last_ns", "node", "order",
-                 "ordered", "silent", "state")
+    __slots__ = ("_devices", "answered_ns", "boots_ns", "bus", "due", "gaps", "guard_ns", "heard", "heartbeat_ns", "history",
+                 "last_ns", "life_ns", "node", "order", "ordered", "silent", "state", "stuck", "toggle")
 
-    def __init__(self, devices: Devices, bus: int, node: int, heartbeat_ns: int | None):
+    def __init__(self, devices: Devices, bus: int, node: int, device: Device | None):
         self._devices = devices
         self.bus, self.node = bus, node
-        self.heartbeat_ns = heartbeat_ns
+        self.heartbeat_ns = device.heartbeat_ns if device is not None else None
+        self.guard_ns = device.guard_ns or 0 if device is not None else 0
+        self.life_ns = self.guard_ns * device.life_factor + self.guard_ns // 2 if device is not None else 0
+        self.toggle: int | None = None
+        self.answered_ns = 0
+        self.stuck = False
         self.gaps: list[int] = []
         self.order = devices.timers.order()
         self.due = FAR
@@ -165,9 +191,18 @@ class _Node:
     @property
     def deadline_ns(self) -> int | None:
         """When it counts as silent if nothing comes; None: never."""
-        if not self.heartbeat_ns:
-            return None
-        return max(self.last_ns + max(round(MARGIN * self.heartbeat_ns), SHORTEST_NS), self.boots_ns)
+        limit_ns = self.life_ns or round(MARGIN * (self.heartbeat_ns or 0))
+        return max(self.last_ns + max(limit_ns, SHORTEST_NS), self.boots_ns) if limit_ns else None
+
+    def is_right(self, t_ns: int, answer: int) -> bool:
+        """Whether what a guarded device says is a boot-up or a right answer; of others everything is right."""
+        if not self.guard_ns:
+            return True
+        toggle = answer & TOGGLE if answer else None
+        follows = 2 * (t_ns - self.answered_ns) < 3 * self.guard_ns
+        self.stuck = toggle is not None and toggle == self.toggle and follows
+        self.toggle, self.answered_ns = toggle, t_ns
+        return not self.stuck
 
     def sign(self, t_ns: int, state: int) -> None:
         """A boot-up or heartbeat."""
@@ -187,7 +222,7 @@ class _Node:
             self._devices.timers.set(self, deadline)
 
     def _learn(self, gap_ns: int) -> None:
-        if self.heartbeat_ns is None and 0 < gap_ns <= LONGEST_LEARNED_NS:
+        if self.heartbeat_ns is None and not self.guard_ns and 0 < gap_ns <= LONGEST_LEARNED_NS:
             self.gaps.append(gap_ns)
             if len(self.gaps) >= LEARN - 1:
                 self.heartbeat_ns = max(self.gaps)
@@ -204,14 +239,32 @@ class _Node:
             self._devices.lost(now_ns, self)
 
 
+class _Guard:
+    """Asks a device for its state at its guard time."""
+
+    __slots__ = ("_host", "_key", "_timers", "due", "guard_ns", "order")
+
+    def __init__(self, host: Host, timers: Timers, key: int, guard_ns: int):
+        self._host, self._timers, self._key = host, timers, key
+        self.guard_ns = guard_ns
+        self.order = timers.order()
+        self.due = FAR
+
+    def expire(self, now_ns: int) -> None:
+        """Ask; the question is worth nothing any more when the next one is due."""
+        self._host.hand_out(Send(now_ns, self._key, b"\0", "node guarding", "CANopen", now_ns + self.guard_ns))
+        self._timers.set(self, now_ns + self.guard_ns)
+
+
 class Devices:
     """The CANopen devices of all buses.
 
     catalog: what DBC files define, so that its identifiers are not mistaken. devices: those known from the configuration.
-    counters: takes what is worth counting, but no alarm.
+    counters: takes what is worth counting, but no alarm. asks: guarded devices are asked; else it is only listened to them.
     """
 
-    def __init__(self, catalog: Catalog, devices: Iterable[Device], host: Host, timers: Timers, counters: Counter[str]):
+    def __init__(self, catalog: Catalog, devices: Iterable[Device], host: Host, timers: Timers, counters: Counter[str],
+                 asks: bool = True):
         self.timers = timers
         self._host = host
         self._counters = counters
@@ -221,6 +274,13 @@ class Devices:
             (bus, message.can_id): message for name, message in catalog.messages.items() if not message.extended
             for bus in catalog.buses.get(name, (0,))}
         self._nodes: dict[tuple[int, int], _Node] = {}
+        self._guards = {guard_key(bus, node): _Guard(host, timers, guard_key(bus, node), device.guard_ns)
+                        for (bus, node), device in self._known.items() if asks and device.guard_ns}
+
+    @property
+    def questions(self) -> frozenset[int]:
+        """Keys of the remote frames that it may send."""
+        return frozenset(self._guards)
 
     def listeners(self) -> dict[int, Listener]:
         """Who wants to hear which 11-bit identifier."""
@@ -232,11 +292,13 @@ class Devices:
     def start(self, t_ns: int) -> None:
         """The time line begins: from now on devices that must be there are waited for."""
         for (bus, number), device in self._known.items():
-            if device.required and device.heartbeat_ns:
-                node = self._node(bus, number)
+            node = self._node(bus, number) if device.required else None
+            if node is not None and node.deadline_ns is not None:
                 node.last_ns = t_ns
                 node.boots_ns = t_ns + BOOT_NS
                 node.wait()
+        for key, guard in self._guards.items():
+            self.timers.set(guard, t_ns + (key & 0x7F) * STAGGER_NS)
 
     def name(self, bus: int, node: int) -> str:
         """How to call a device in a text."""
@@ -263,7 +325,7 @@ class Devices:
     # --- what is heard ----------------------------------------------------------------------------------------------------
 
     def heartbeat(self, t_ns: int, key: int, data: bytes) -> None:
-        """A heartbeat, a boot-up, or the answer of a guarded node, whose highest bit alternates."""
+        """A heartbeat, a boot-up, or the answer of a guarded device."""
         bus, number = key >> BUS_SHIFT, key & 0x7F
         defined = self._defined.get((bus, key & 0x7FF))
         if len(data) != 1 or data[0] & 0x7F not in STATES or defined is not None and defined.length != 1:
@@ -272,8 +334,10 @@ class Devices:
             return
         self._buses.add(bus)
         node = self._node(bus, number)
-        booted = data[0] == 0
-        if booted:
+        if not node.is_right(t_ns, data[0]):
+            self._counters["CANopen: answers to guarding that do not alternate"] += 1
+            return
+        if data[0] == 0:
             self._booted(t_ns, node)
         known = node.heard and not node.silent
         node.sign(t_ns, data[0] & 0x7F)
@@ -331,8 +395,10 @@ class Devices:
         last = STATES[node.state] if node.state is not None else "never heard"
         quiet_s = (t_ns - node.last_ns) / 1e9
         detail = self._who(node.bus, node.node) | {"LastState": last, "Silent": f"{quiet_s:.3f} s"}
+        said = "no heartbeat" if not node.guard_ns else "no right answer to guarding (its toggle bit stands still)" \
+            if node.stuck else "no answer to guarding"
         why = f"has not come back {quiet_s:g} s after it was reset" if node.ordered else \
-            f"no heartbeat for {quiet_s:g} s" if node.heard else f"was not heard within {quiet_s:g} s of the start"
+            f"{said} for {quiet_s:g} s" if node.heard else f"was not heard within {quiet_s:g} s of the start"
         node.ordered = False
         self._host.report(t_ns, DEVICE_SILENT, f"{node.bus}/{node.node}", True, detail, f"{self.name(node.bus, node.node)}: {why}")
 
@@ -368,9 +434,13 @@ class Devices:
     def _node(self, bus: int, number: int) -> _Node:
         node = self._nodes.get((bus, number))
         if node is None:
-            device = self._known.get((bus, number))
-            node = self._nodes[bus, number] = _Node(self, bus, number, device.heartbeat_ns if device is not None else None)
+            node = self._nodes[bus, number] = _Node(self, bus, number, self._known.get((bus, number)))
         return node
+
+
+def guard_key(bus: int, node: int) -> int:
+    """The key of the remote frame by which a device is guarded."""
+    return frame_key(HEARTBEAT + node, False, bus) | REMOTE
 
 
 def _history(node: _Node) -> dict[str, Any]:

@@ -18,7 +18,8 @@ class Frame(NamedTuple):
     t_ns: nanoseconds on the caller's monotonic (or the recording's) time line.
     key:  SocketCAN `canid_t` (29-bit identifiers carry `EXTENDED`), plus the bus index shifted by `BUS_SHIFT`:
           one integer that names the talker, so that a dictionary finds its decoder in one step.
-    data: 0–8 payload bytes (CAN), up to 64 (CAN FD), up to 1785 (reassembled J1939 transport protocol).
+    data: 0–8 payload bytes (CAN), up to 64 (CAN FD), up to 1785 (reassembled J1939 transport protocol). A remote frame has none;
+          in one that is to be sent stand as many zeros as it asks for.
     """
 
     t_ns: int

@@ -2,16 +2,20 @@
 
 Only messages whose sender is `UCS` and which a repair, a command or an alarm uses, or which are readings of the UCS itself;
 only values within the bits and the limits of the DBC; no more frames than a burst allows. What passes gets an expiry, so that
-nothing stale is sent late.
+nothing stale is sent late. Of protocols, only what makes the UCS a node of J1939 where it has an address, and the questions of
+node guarding.
 """
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from fractions import Fraction
 
 from level1.catalog import Catalog, Message, Signal
 from level1.decode import RawValue, Scale, raw_range, reader, reserved
+from level1.event import Send
+from level1.frame import BUS_SHIFT, EXTENDED, REMOTE, j1939_pgn
+from level1.j1939_node import SENT_GROUPS
 
 DEFAULT_LIFE_NS = 100_000_000
 """A frame of a message without cycle time is worthless after this; others after one cycle."""
@@ -29,14 +33,17 @@ class Refused(Exception):
 
 
 class Gate:
-    """The allow-list and the limits. readings: allowed too, and to say *not available* and *error*, which no command may."""
+    """The allow-list and the limits. readings: allowed too, and to say *not available* and *error*, which no command may.
+    j1939: buses on which the UCS is a node. questions: keys of remote frames that may be sent."""
 
-    def __init__(self, catalog: Catalog, allowed: Iterable[str], readings: frozenset[str] = frozenset()):
+    def __init__(self, catalog: Catalog, allowed: Iterable[str], readings: frozenset[str] = frozenset(),
+                 j1939: Collection[int] = (), questions: Collection[int] = ()):
         self.catalog = catalog
         self.readings = readings
         self.allowed = frozenset(name for name in {*allowed, *readings} if catalog.messages[name].sent_by_ucs)
-        self.recent: dict[str, list[int]] = {}
+        self.recent: dict[str | int, list[int]] = {}
         self._limits = {name: _limits(catalog.messages[name], name in readings) for name in self.allowed}
+        self._j1939, self._questions = frozenset(j1939), frozenset(questions)
 
     def check(self, t_ns: int, name: str, data: bytes) -> int:
         """Let a payload pass and give the time (ns) until which it may be sent. Raises Refused."""
@@ -50,11 +57,23 @@ class Gate:
             if not low <= raw <= high and not any(first <= raw <= last for first, last, _ in free):
                 physical = Fraction(signal.factor) * Fraction(raw) + Fraction(signal.offset)
                 raise Refused(f"{name}.{signal.name}: {float(physical):g} is outside {signal.minimum} … {signal.maximum}")
-        recent = [sent for sent in self.recent.get(name, ()) if sent > t_ns - BURST_NS]
+        self._count(t_ns, name, name)
+        return t_ns + (message.cycle_ns or DEFAULT_LIFE_NS)
+
+    def check_protocol(self, send: Send) -> None:
+        """Let a frame of a protocol pass. Raises Refused."""
+        key = send.key
+        node = bool(key & EXTENDED) and key >> BUS_SHIFT in self._j1939 and j1939_pgn(key & 0x1FFF_FFFF) in SENT_GROUPS
+        if key not in self._questions if key & REMOTE else not node:
+            raise Refused(f"{send.message}: {key & 0x1FFF_FFFF:X} is not on the list of what the UCS may send")
+        self._count(send.t_ns, key, send.message)
+
+    def _count(self, t_ns: int, key: str | int, name: str) -> None:
+        """Raises Refused when there were too many of these."""
+        recent = [sent for sent in self.recent.get(key, ()) if sent > t_ns - BURST_NS]
         if len(recent) >= BURST:
             raise Refused(f"{name}: more than {BURST} frames in {BURST_NS // 1_000_000} ms")
-        self.recent[name] = [*recent, t_ns]
-        return t_ns + (message.cycle_ns or DEFAULT_LIFE_NS)
+        self.recent[key] = [*recent, t_ns]
 
 
 def _limits(message: Message, is_reading: bool) -> list[_Limit]:

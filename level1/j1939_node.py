@@ -22,6 +22,8 @@ ADDRESS_CLAIMED = 60928
 REQUEST = 59904
 ACKNOWLEDGEMENT = 59392
 DM2 = 65227
+SENT_GROUPS = frozenset({ADDRESS_CLAIMED, REQUEST, ACKNOWLEDGEMENT, DM1, TP_CM, TP_DT})
+"""All that a node sends by itself."""
 GLOBAL, NULL = 255, 254
 CLAIM_NS = 250_000_000
 """Silence after a claim (J1939-81 §4.2.2)."""
@@ -47,7 +49,7 @@ class Node:
     """The UCS on one bus.
 
     address: the present source address, None while it is being claimed or can't be. transmit(t_ns, key, data, what) sends.
-    conflict(t_ns, address, name): another node claims this one's address (name), or uses it (name empty); name None: it is over.
+    conflict(t_ns, address, name): another node claims this one's address; name None: that is over, the address is its own.
     """
 
     __slots__ = ("_claimed", "_conflict", "_messages", "_queue", "_sender", "_taken", "_transmit", "address", "bus", "codes", "due",
@@ -136,10 +138,9 @@ class Node:
         if not known:
             self._sender.begin(now_ns)
 
-    def used(self, t_ns: int, key: int) -> None:
+    def used(self, t_ns: int) -> None:
         """A frame has come in from this node's own address: someone else uses it, and is told whose it is (J1939-81 §4.4)."""
-        if self.address is not None and key & 0xFF == self.address and self.due == FAR:
-            self._conflict(t_ns, self.address, b"")
+        if self.address is not None and self.due == FAR:
             self._transmit(t_ns, self.key(ADDRESS_CLAIMED), self.name, "address claim")
             self.timers.set(self, t_ns + CLAIM_NS)
 

@@ -208,7 +208,6 @@ class Passage:
 
     def __init__(self, supervisor: Supervisor, plan: Plan, table: Table, block: Block, t_ns: Ints, talkers: Talkers):
         self.board: Board = supervisor.board
-        self._meet = supervisor.meet
         self._timers = supervisor.timers
         self._plan = plan
         self._block = block
@@ -486,7 +485,7 @@ class Passage:
     def _feed(self, t_ns: int, key: int, data: bytes) -> None:
         """A frame for the board, as in `Supervisor.receive_many`."""
         board = self.board
-        page = board.table[key] if key in board.table else self._meet(t_ns, key)
+        page = board.table[key] if key in board.table else board.bind(key)
         if page is None:
             return
         passing = self.pages.get(page) if isinstance(page, Page) else None

@@ -2,7 +2,8 @@
 
 Every active trouble code is a cause of the alarm `TroubleCode`, and answers `dtc()` in conditions. Where the UCS has claimed an
 address, its own alarms go out as trouble codes, and strangers under its address or its identifiers are causes of
-`AddressConflict` and `SecondTalker`. The alarms are those of `ucs.dbc`; without it only `dtc()` and the node are left.
+`AddressConflict` and `SecondTalker`, for as long as they talk and `QUIET_NS` longer. The alarms are those of `ucs.dbc`; without it
+only `dtc()` and the node are left.
 """
 from __future__ import annotations
 
@@ -11,13 +12,13 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Protocol
 from zlib import crc32
 
-from level1.board import Board
+from level1.board import Board, Listener
 from level1.condition import Things
 from level1.event import Send
 from level1.frame import BUS_SHIFT, EXTENDED
 from level1.j1939 import DM1, FMI_WORDS, TP_CM, TP_DT, Transport, TroubleCodeReport, parse_dm1
 from level1.j1939_node import ADDRESS_CLAIMED, DM2, GLOBAL, NULL, REQUEST, Node, name_of
-from level1.timer import Timers
+from level1.timer import FAR, Timers
 
 TROUBLE_CODE = "TroubleCode"
 """Alarm of `ucs.dbc` whose causes are the active trouble codes of all senders."""
@@ -25,6 +26,8 @@ ADDRESS_CONFLICT = "AddressConflict"
 """Alarm of `ucs.dbc`: another node claims or uses the address of the UCS."""
 SECOND_TALKER = "SecondTalker"
 """Alarm of `ucs.dbc`: someone else sends a message that is the UCS's own."""
+QUIET_NS = 5_000_000_000
+"""A stranger who has not been heard for so long has stopped: what only the UCS sends comes once a second."""
 PROTOCOL_LIFE_NS = 1_000_000_000
 """A frame of a protocol is worthless after this: T3 of the transport protocol is 1.25 s, and the first claim of an address must
 outlive the start of the program."""
@@ -60,8 +63,10 @@ class Subsystems:
         self.things = things
         self.counters = counters
         self.own_keys: Collection[int] = ()
-        self.heard_ns = 0
         self.transport: Transport | None = None
+        self._timers = timers
+        self._strangers: dict[tuple[str, str], _Stranger] = {}
+        self._addresses: dict[int, int] = {}
         self._codes: dict[int, dict[str, TroubleCodeReport]] = {}
         self._nodes = {bus: self._node(bus, address, unit, timers) for bus, address in addresses.items()}
         if wanted or self._nodes:
@@ -70,7 +75,10 @@ class Subsystems:
         board.newcomer = self.newcomer
 
     def start(self, t_ns: int) -> None:
-        """The time line begins: claim the addresses."""
+        """The time line begins: claim the addresses. Strangers of an earlier boot are over unless they are heard again."""
+        for alarm in (SECOND_TALKER, ADDRESS_CONFLICT):
+            for key in self.host.causes(alarm):
+                self._stranger(alarm, key).wait(t_ns)
         for node in self._nodes.values():
             node.start(t_ns)
 
@@ -104,15 +112,30 @@ class Subsystems:
         codes = "; ".join(f"SPN {code.spn} FMI {code.fmi} × {code.occurrences}" for code in diagnosis.codes)
         self.host.tell(t_ns, "dm2", {"SourceAddress": key & 0xFF, "Bus": key >> BUS_SHIFT, "Codes": codes})
 
-    def newcomer(self, key: int) -> None:
-        """An identifier is heard for the first time: is it one that only the UCS may send?"""
-        if key in self.own_keys:
-            self.host.report(self.heard_ns, SECOND_TALKER, f"{key:X}", True,
-                             {"Id": f"{key & 0x1FFF_FFFF:X}", "Bus": key >> BUS_SHIFT},
-                             f"someone else sends the message with identifier {key & 0x1FFF_FFFF:X}")
-        node = self._nodes.get(key >> BUS_SHIFT)
-        if node is not None and key & EXTENDED and key >> 8 & 0x3FF00 != ADDRESS_CLAIMED:
-            node.used(self.heard_ns, key)
+    def newcomer(self, key: int) -> Listener | None:
+        """An identifier is heard for the first time: is it one that only the UCS may send? Then every frame of it is looked at."""
+        bus, can_id = key >> BUS_SHIFT, key & 0x1FFF_FFFF
+        node = self._nodes.get(bus)
+        uses_address = node is not None and bool(key & EXTENDED) and key & 0xFF == node.address and \
+            key >> 8 & 0x3FF00 != ADDRESS_CLAIMED
+        if key not in self.own_keys and not uses_address:
+            return None
+
+        def listener(t_ns: int, key: int, data: bytes) -> None:
+            if key in self.own_keys:
+                self._stranger(SECOND_TALKER, f"{key:X}").heard(
+                    t_ns, {"Id": f"{can_id:X}", "Bus": bus}, f"someone else sends the message with identifier {can_id:X}")
+            if node is not None and uses_address and key & 0xFF == node.address:
+                node.used(t_ns)
+                self._stranger(ADDRESS_CONFLICT, f"{bus}/use").heard(
+                    t_ns, {"SourceAddress": key & 0xFF, "Bus": bus, "Name": "unknown"},
+                    f"another node uses source address {key & 0xFF}")
+        return listener
+
+    def _stranger(self, alarm: str, key: str) -> _Stranger:
+        if (alarm, key) not in self._strangers:
+            self._strangers[alarm, key] = _Stranger(self.host, self._timers, alarm, key)
+        return self._strangers[alarm, key]
 
     def _listen(self, transport: Transport) -> None:
         """Hear what J1939 says beyond single frames, and let the own node answer where there is one."""
@@ -138,10 +161,12 @@ class Subsystems:
             self.host.hand_out(Send(t_ns, key, data, what, "J1939", t_ns + PROTOCOL_LIFE_NS))
 
         def conflict(t_ns: int, contested: int, name: bytes | None) -> None:
-            other = name.hex().upper() if name else "unknown"
             self.host.report(t_ns, ADDRESS_CONFLICT, str(bus), name is not None,
-                             {"SourceAddress": contested, "Bus": bus, "Name": other},
-                             f"another node {'claims' if name else 'uses'} source address {contested}")
+                             {"SourceAddress": contested, "Bus": bus, "Name": name.hex().upper() if name else ""},
+                             f"another node claims source address {contested}")
+            if name is None and self._addresses.get(bus) != contested:  # it is the own one from now on
+                self._addresses[bus] = contested
+                self.board.unbind(bus, contested)
         return Node(bus, name_of(crc32(unit.encode())), address, timers, transmit, conflict)
 
     def _diagnosed(self, t_ns: int, key: int, data: bytes) -> None:
@@ -171,3 +196,37 @@ class Subsystems:
             if cell.k != k:
                 cell.k = k
                 self.board.queue(cell)
+
+
+class _Stranger:
+    """Someone who sends what only the UCS may: a cause of an alarm until it has been quiet."""
+
+    __slots__ = ("_alarm", "_host", "_key", "_timers", "due", "last_ns", "order", "there")
+
+    def __init__(self, host: Host, timers: Timers, alarm: str, key: str):
+        self._host, self._timers, self._alarm, self._key = host, timers, alarm, key
+        self.order = timers.order()
+        self.due = FAR
+        self.last_ns = 0
+        self.there = False
+
+    def heard(self, t_ns: int, detail: dict[str, Any], text: str) -> None:
+        """A frame of it."""
+        if not self.there:
+            self.there = True
+            self._host.report(t_ns, self._alarm, self._key, True, detail, text)
+        self.wait(t_ns)
+
+    def wait(self, t_ns: int) -> None:
+        """See to it that its quiet is noticed. A deadline that is set already looks anew when it comes."""
+        self.last_ns = t_ns
+        if self.due == FAR:
+            self._timers.set(self, t_ns + QUIET_NS)
+
+    def expire(self, now_ns: int) -> None:
+        """It may be quiet."""
+        if self.last_ns + QUIET_NS > now_ns:
+            self._timers.set(self, self.last_ns + QUIET_NS)
+        else:
+            self.there = False
+            self._host.report(now_ns, self._alarm, self._key, False, {}, "")

@@ -14,7 +14,7 @@ from itertools import chain
 from typing import Any
 
 from level1.alarm import AlarmMachine
-from level1.board import ALWAYS, Board, Cell, Page, Tap, Watch
+from level1.board import ALWAYS, Board, Cell, Watch
 from level1.canopen import DEVICE_EMERGENCY, DEVICE_SILENT, NMT, Device, Devices
 from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Catalog, Command, Message, Repair
 from level1.command import Order
@@ -56,7 +56,7 @@ class Supervisor:
 
     unit: its name. boot, with the seq given to each event, is the event's identity: never give the same boot twice. seq:
     last one used. j1939: bus index -> source address to claim there. armed: alarms whose repairs may act; None arms all.
-    broadcast: send the alarm messages on the bus. start_ns: when the time line begins, None: at the first input.
+    broadcast: send the alarm messages on the bus, and guard devices. start_ns: when the time line begins, None: at the first input.
     devices: CANopen devices known beforehand; others are learned when they are heard.
     monitor_ns: period of the monitoring messages, None for none. utc_offset_ns: UTC minus time line, None where no wall
     clock is known; it may be set at any time, as may utc_trusted. restored: the state stored at the end of an earlier boot.
@@ -93,12 +93,13 @@ class Supervisor:
         self._inputs: dict[str, list[tuple[str, Callable[[int], Any]]]] = {}
         self._watches: list[Watch] = []
         self._repairs: dict[str, RepairMachine] = {}
-        self._devices = Devices(catalog, devices, self, self.timers, self.counters) \
+        self._devices = Devices(catalog, devices, self, self.timers, self.counters, asks=broadcast) \
             if DEVICE_EMERGENCY in self._alarms or DEVICE_SILENT in self._alarms else None
         self._compile(j1939 or {})
         self._broadcasts = self._make_broadcasts() if broadcast else {}
         self._samplers = self._make_samplers(monitor_ns) if monitor_ns else []
-        self.gate = Gate(catalog, self.sendable(), frozenset(readings))
+        self.gate = Gate(catalog, self.sendable(), frozenset(readings), j1939 or (),
+                         self._devices.questions if self._devices is not None else ())
         self.subsystems.own_keys = frozenset(
             frame_key(message.can_id, message.extended, bus) for name in self._broadcasts
             for message in (catalog.messages[name],) if message.senders == ("UCS",) for bus in catalog.buses.get(name, (0,)))
@@ -134,7 +135,7 @@ class Supervisor:
             try:
                 page = table[key]
             except KeyError:
-                page = self.meet(t, key)
+                page = board.bind(key)
             if page is None:
                 continue
             page.t_ns = t
@@ -261,11 +262,6 @@ class Supervisor:
         """Let the time line begin, unless it has."""
         if not self._begun:
             self._begin(t_ns)
-
-    def meet(self, t_ns: int, key: int) -> Page | Tap | None:
-        """The page of an identifier heard for the first time, or again for the first time since its page fell silent."""
-        self.subsystems.heard_ns = t_ns
-        return self.board.bind(key)
 
     def take(self, now_ns: int) -> list[Output]:
         """The outputs so far; frames up to now have been received."""
@@ -430,8 +426,13 @@ class Supervisor:
         return self.seq
 
     def hand_out(self, send: Send) -> None:
-        """A frame of a protocol, which no definition names."""
-        self._out.append(send)
+        """Hand a frame of a protocol, which no definition names, out through the gate."""
+        try:
+            self.gate.check_protocol(send)
+        except Refused:
+            self.counters["frames refused by the gate"] += 1
+        else:
+            self._out.append(send)
 
     def tell(self, t_ns: int, message: str, values: dict[str, Any]) -> None:
         """A monitoring message of what a subsystem has been asked for."""

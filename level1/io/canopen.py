@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import dbc
-from level1.canopen import DEVICE_EMERGENCY, HISTORY, MAX_HISTORY, SDO_ANSWER, Device
+from level1.canopen import DEVICE_EMERGENCY, HISTORY, LIFE_FACTOR, MAX_HISTORY, SDO_ANSWER, Device
 from level1.eds import MAX_SIZE, DataSheet, EdsError, parse
 from level1.event import Event
-from level1.io.config import Bus, CanopenDevice, Config, ConfigError
+from level1.io.config import SHORTEST_GUARD_NS, Bus, CanopenDevice, Config, ConfigError
 from level1.io.error import did_you_mean
 
 SDO_REQUEST = 0x600
@@ -47,7 +47,11 @@ def devices(settings: Config) -> tuple[Device, ...]:
 def _device(bus: int, device: CanopenDevice) -> Device:
     sheet = _sheet(device.eds) if device.eds is not None else DataSheet()
     heartbeat_ns = device.heartbeat_ns if device.heartbeat_ns is not None else sheet.heartbeat_ns
-    return Device(bus, device.node, device.name or sheet.name, heartbeat_ns, device.required, sheet.errors)
+    guard_ns = device.guard_ns
+    if guard_ns is None and not heartbeat_ns and sheet.guard_ns:  # a device that has both sends its heartbeat (CiA 301 §7.2.8.3.2)
+        guard_ns = max(sheet.guard_ns, SHORTEST_GUARD_NS)
+    return Device(bus, device.node, device.name or sheet.name, 0 if guard_ns else heartbeat_ns, device.required, sheet.errors,
+                  guard_ns or None, device.life_factor or sheet.life_factor or LIFE_FACTOR)
 
 
 def _sheet(name: str) -> DataSheet:

@@ -23,6 +23,8 @@ UNITS_NS = {"us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "min": 60_000_000_
 SCHEMES = ("mqtt", "mqtts")
 FASTEST_HEALTH_NS, SLOWEST_HEALTH_NS = 100_000_000, 1_000_000_000
 """UCS_HEALTH promises to come once a second (`ucs.dbc`)."""
+SHORTEST_GUARD_NS, LONGEST_GUARD_NS = 20_000_000, 65_535_000_000
+"""The gate lets 20 frames of one kind pass in 100 ms; object 0x100C holds no more."""
 SHORTEST_PERIOD_NS, LONGEST_PERIOD_NS = 10_000_000, 60_000_000_000
 _DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)")
 _TOPIC_LEVEL = re.compile(r"[^\s/+#$\x00-\x1f\x7f][^\s/+#\x00-\x1f\x7f]{0,63}")
@@ -43,15 +45,18 @@ class Unit(msgspec.Struct, frozen=True):
 class CanopenDevice(msgspec.Struct, frozen=True):
     """A CANopen device on a bus. node: its id, 1 to 127. eds: its data sheet, a file beside the configuration or a shipped one.
 
-    name, heartbeat: instead of what the data sheet says (heartbeat "0 s": it sends none). required: told as silent also when it
-    was never heard; without that, an implement that is not coupled is no fault. history: read its last errors by SDO when it
-    reports an emergency.
+    name, heartbeat: instead of what the data sheet says (heartbeat "0 s": it sends none). guard, life_factor: guard time and life
+    time factor of a device without heartbeat, instead of what the data sheet says (guard "0 s": it is not asked). required: told as
+    silent also when it was never heard; without that, an implement that is not coupled is no fault. history: read its last errors
+    by SDO when it reports an emergency.
     """
 
     node: int
     eds: str | None = None
     name: str | None = None
     heartbeat_ns: int | None = None
+    guard_ns: int | None = None
+    life_factor: int | None = None
     required: bool = False
     history: bool = False
 
@@ -323,6 +328,25 @@ def _canopen_problems(devices: Any, path: str) -> Iterator[str]:
             yield f"{path}: {node} is no node id; take one of 1 to 127"
         elif count > 1:
             yield f"{path}: {count} devices have the node id {node}; each on a bus has its own"
+    for place, device in enumerate(tables):
+        yield from _guarding_problems(device, f"{path}[{place}]")
+
+
+def _guarding_problems(device: Mapping[str, Any], path: str) -> Iterator[str]:
+    """A guard time or life time factor that can't be, or one beside a heartbeat."""
+    factor = device.get("life_factor")
+    if isinstance(factor, int) and not 1 <= factor <= 255:
+        yield f"{path}.life_factor: {factor} is outside 1 to 255"
+    times = {}
+    for name in ("guard", "heartbeat"):
+        text = device.get(name)
+        if isinstance(text, str) and not list(_duration_problems(text, "")):
+            times[name] = duration_ns(text)
+    guard_ns = times.get("guard", 0)
+    if guard_ns and not SHORTEST_GUARD_NS <= guard_ns <= LONGEST_GUARD_NS:
+        yield f'{path}.guard: "{device["guard"]}" is outside 20 ms to 65.535 s'
+    if guard_ns and times.get("heartbeat"):
+        yield f"{path}: a device is watched by its heartbeat or by guarding; take one of the two out"
 
 
 def _hashable(bus: Mapping[str, Any]) -> bool:

@@ -273,7 +273,9 @@ class _File:
     def _message(self, item: Frame | Send) -> can.Message:
         key = item.key
         can_id = key & (0x1FFF_FFFF if key & EXTENDED else 0x1FFF_FFFF if key & ERROR else 0x7FF)
+        is_remote = bool(key & REMOTE)
         return can.Message(timestamp=(item.t_ns + self._offset_ns) / 1e9, arbitration_id=can_id,
-                           is_extended_id=bool(key & EXTENDED), is_remote_frame=bool(key & REMOTE),
-                           is_error_frame=bool(key & ERROR), channel=(key >> BUS_SHIFT) & 0xFF, data=item.data,
+                           is_extended_id=bool(key & EXTENDED), is_remote_frame=is_remote,
+                           is_error_frame=bool(key & ERROR), channel=(key >> BUS_SHIFT) & 0xFF, dlc=len(item.data),
+                           data=None if is_remote else item.data,
                            is_fd=len(item.data) > CLASSIC_BYTES, is_rx=isinstance(item, Frame))

@@ -4,6 +4,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from level1.canopen import BOOT_NS, ERRORS, MARGIN, MAX_ERRORS, Device, describe, outlives, parse_emergency
 from level1.catalog import Message, Repair
 from level1.command import Order
-from level1.event import Event, Output, Result
+from level1.event import Event, Output, Result, Send
 from level1.expression import Boolean, SendStep
 from level1.frame import BUS_SHIFT, EXTENDED, REMOTE, Frame, frame_key
 from level1.supervisor import Supervisor
@@ -202,6 +203,118 @@ def test_a_device_taken_off_on_purpose_is_forgotten_when_someone_at_the_machine_
     assert reset(13 * SECOND) == ("no device is silent", [])
     assert told(target.receive_many([heartbeat(14 * SECOND, BOOT_UP), heartbeat(14 * SECOND, node=43)])) == []
     assert told(target.tick(30 * SECOND)) == [(15.75, "DeviceSilent", "raised")] * 2
+
+
+# --- node guarding ----------------------------------------------------------------------------------------------------------
+
+GUARDED = Device(0, 42, "Old valve", 0, guard_ns=200 * MS, life_factor=3)
+
+
+class Valve:
+    """A guarded device: answers each remote frame with its state, whose highest bit alternates (CiA 301 §7.2.8.3.2.2.1)."""
+
+    def __init__(self, target: Supervisor):
+        self.target = target
+        self.there = self.alternates = True
+        self.loses: set[int] = set()
+        self.asked: list[Send] = []
+        self.toggle = 0
+
+    def run(self, until_ns: int) -> list[Event]:
+        """Time passes; an answer comes 2 ms after its question. Gives the events."""
+        events: list[Event] = []
+        while (due := self.target.next_deadline()) is not None and due <= until_ns:
+            outputs = list(self.target.tick(due))
+            while outputs:
+                output = outputs.pop(0)
+                if isinstance(output, Event):
+                    events.append(output)
+                elif isinstance(output, Send) and output.key & REMOTE:
+                    outputs += self.answer(output)
+        return events + [output for output in self.target.tick(until_ns) if isinstance(output, Event)]
+
+    def answer(self, question: Send) -> Sequence[Output]:
+        self.asked.append(question)
+        if not self.there:
+            return ()
+        state = OPERATIONAL | self.toggle
+        self.toggle ^= 0x80 if self.alternates else 0
+        if len(self.asked) in self.loses:
+            return ()
+        return self.target.receive(heartbeat(question.t_ns + 2 * MS, state))
+
+
+def test_a_guarded_device_is_asked_every_guard_time_and_silent_after_its_life_time() -> None:
+    valve = Valve(unit(GUARDED, start_ns=0, broadcast=True))
+    assert valve.run(10 * SECOND) == []
+    assert [question.t_ns for question in valve.asked] == [(42 + 200 * n) * MS for n in range(50)]
+    assert {(question.key, question.data, question.expires_ns - question.t_ns) for question in valve.asked} == {
+        (0x72A | REMOTE, b"\0", 200 * MS)}
+    valve.there = False
+    events = valve.run(20 * SECOND)
+    assert told(events) == [(10.544, "DeviceSilent", "raised")]
+    assert events[0].text == "Old valve (node 42): no answer to guarding for 0.7 s"
+    assert events[0].values["LastState"] == "operational"
+    valve.there = True
+    assert told(valve.run(30 * SECOND)) == [(20.044, "DeviceSilent", "cleared")]
+    assert valve.target.counters["CANopen: answers to guarding that do not alternate"] == 0
+
+
+def test_two_answers_that_are_lost_are_no_silence_whichever_bit_the_next_one_has() -> None:
+    valve = Valve(unit(GUARDED, start_ns=0, broadcast=True))
+    valve.loses = {10, 20, 30, 31, 40, 41}
+    assert valve.run(20 * SECOND) == []
+    assert valve.target.counters["CANopen: answers to guarding that do not alternate"] == 0
+    valve.loses = {110, 111, 112}
+    assert told(valve.run(30 * SECOND)) == [(22.344, "DeviceSilent", "raised"), (22.444, "DeviceSilent", "cleared")]
+
+
+def test_answers_that_do_not_alternate_are_those_of_a_dead_program() -> None:
+    valve = Valve(unit(GUARDED, start_ns=0, broadcast=True))
+    valve.run(10 * SECOND)
+    valve.alternates = False
+    events = valve.run(20 * SECOND)
+    assert told(events) == [(10.744, "DeviceSilent", "raised")], "the first that stands still looks right"
+    assert events[0].text == "Old valve (node 42): no right answer to guarding (its toggle bit stands still) for 0.7 s"
+    valve.alternates = True
+    assert [event for _, _, event in told(valve.run(21 * SECOND))] == ["cleared"]
+
+
+def test_a_guarded_device_that_boots_begins_anew() -> None:
+    valve = Valve(unit(GUARDED, start_ns=0, broadcast=True))
+    valve.run(10 * SECOND)
+    valve.target.receive(heartbeat(10 * SECOND, BOOT_UP))
+    valve.toggle = 0x80
+    assert valve.run(12 * SECOND) == []
+    assert valve.target.counters["CANopen: answers to guarding that do not alternate"] == 0
+
+
+def test_a_guarded_device_that_was_never_there_is_missed_only_where_it_is_required() -> None:
+    absent = Valve(unit(GUARDED, start_ns=0, broadcast=True))
+    absent.there = False
+    assert absent.run(20 * SECOND) == [] and len(absent.asked) == 100, "it may be coupled at any time"
+    required = Valve(unit(msgspec.structs.replace(GUARDED, required=True), start_ns=0, broadcast=True))
+    required.there = False
+    events = required.run(20 * SECOND)
+    assert told(events) == [(BOOT_NS / SECOND, "DeviceSilent", "raised")]
+
+
+def test_only_configured_devices_are_asked_and_nobody_in_a_replay() -> None:
+    assert not unit(SPRAYER, broadcast=True)._devices.questions  # type: ignore[union-attr]
+    listener = Valve(unit(GUARDED, start_ns=0, broadcast=False))
+    listener.run(10 * SECOND)
+    assert listener.asked == []
+    frames = [heartbeat(11 * SECOND + n * 200 * MS, OPERATIONAL | (n % 2) << 7) for n in range(10)]
+    assert told(listener.target.receive_many(frames)) == []
+    assert told(listener.target.tick(60 * SECOND)) == [(13.5, "DeviceSilent", "raised")], "what the traffic says counts"
+
+
+def test_no_remote_frame_but_that_of_a_guarded_device_passes_the_gate() -> None:
+    target = unit(GUARDED, start_ns=0, broadcast=True)
+    for key in (0x72B | REMOTE, 0x72A, 0x1AA | REMOTE, 0x72A | REMOTE | 1 << BUS_SHIFT):
+        target.hand_out(Send(0, key, b"\0", "node guarding", "CANopen", SECOND))
+    assert not [output for output in target.tick(0) if isinstance(output, Send) and output.reason == "CANopen"]
+    assert target.counters["frames refused by the gate"] == 4
 
 
 # --- emergencies ------------------------------------------------------------------------------------------------------------

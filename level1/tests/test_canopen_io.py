@@ -13,7 +13,7 @@ import canopen
 import pytest
 
 import dbc
-from level1.canopen import Device
+from level1.canopen import LIFE_FACTOR, Device
 from level1.event import Event, seconds
 from level1.io import config
 from level1.io.canopen import HistoryReader, devices
@@ -51,6 +51,27 @@ def test_a_device_is_what_its_data_sheet_says_unless_the_configuration_says_othe
         (0, 42, "Air-blast sprayer", 500_000_000, False), (0, 43, "Sensors", 2_000_000_000, False), (0, 7, "", 0, True)]
     assert found[1].errors[0xFF03] == "sensor 3 gives no echo (left lower middle)"
     assert load(tmp_path, "") == ()
+
+
+def test_a_device_without_heartbeat_is_guarded_as_its_data_sheet_says_unless_the_configuration_says_otherwise(
+        tmp_path: Path) -> None:
+    guarded = "[DeviceInfo]\nProductName=Old valve\n[100C]\nDefaultValue=200\n[100D]\nDefaultValue=4\n"
+    (tmp_path / "old.eds").write_text(guarded)
+    (tmp_path / "both.eds").write_text(guarded + "[1017]\nDefaultValue=500\n")
+    found = load(tmp_path, "".join(f"[[bus.canopen]]\nnode = {node}\n{lines}\n" for node, lines in enumerate((
+        'eds = "old.eds"', 'eds = "old.eds"\nguard = "1 s"\nlife_factor = 2', 'eds = "old.eds"\nguard = "0 s"', 'eds = "both.eds"',
+        'eds = "both.eds"\nguard = "1 s"', 'eds = "both.eds"\nheartbeat = "0 s"', 'guard = "1 s"'), 1)))
+    assert [(device.guard_ns, device.life_factor, device.heartbeat_ns) for device in found] == [
+        (200_000_000, 4, 0), (1_000_000_000, 2, 0), (None, 4, None), (None, 4, 500_000_000),
+        (1_000_000_000, 4, 0), (200_000_000, 4, 0), (1_000_000_000, LIFE_FACTOR, 0)]
+
+
+def test_guarding_that_can_not_be_is_told(tmp_path: Path) -> None:
+    assert problems(tmp_path, '[[bus.canopen]]\nnode = 1\nguard = "5 ms"\nlife_factor = 0\n'
+                              '[[bus.canopen]]\nnode = 2\nguard = "1 s"\nheartbeat = "1 s"\n') == [
+        "bus[0].canopen[0].life_factor: 0 is outside 1 to 255",
+        'bus[0].canopen[0].guard: "5 ms" is outside 20 ms to 65.535 s',
+        "bus[0].canopen[1]: a device is watched by its heartbeat or by guarding; take one of the two out"]
 
 
 def test_a_data_sheet_beside_the_configuration_comes_first_and_may_be_of_an_old_editor(tmp_path: Path) -> None:

@@ -27,6 +27,14 @@ def test_the_heartbeat_time_is_that_of_object_1017(lines: str, heartbeat_ms: int
     assert sheet.heartbeat_ns == (heartbeat_ms * 1_000_000 if heartbeat_ms else None)
 
 
+def test_guard_time_and_life_time_factor_are_those_of_objects_100c_and_100d() -> None:
+    sheet = parse(f"{MINIMAL}[100C]\nDefaultValue=200\n[100D]\nDefaultValue=3\nParameterValue=0x04\n")
+    assert (sheet.guard_ns, sheet.life_factor) == (200_000_000, 4)
+    for lines in ("DefaultValue=0", "DefaultValue=70000", "DefaultValue=soon"):
+        sheet = parse(f"{MINIMAL}[100C]\n{lines}\n[100D]\n{lines}\n")
+        assert (sheet.guard_ns, sheet.life_factor) == (None, None)
+
+
 def test_error_codes_have_a_section_of_their_own_and_wrong_lines_of_it_are_left_out() -> None:
     sheet = parse(MINIMAL + "[1003]\n[EmergencyErrorCodes]\n0xFF01=no echo\n65282=two\nsoon=three\n0x1FFFF=four\n0xFF03=\n")
     assert sheet.errors == {0xFF01: "no echo", 0xFF02: "two"}

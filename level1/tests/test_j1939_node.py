@@ -1,13 +1,21 @@
 """The UCS as a node: address claim, own trouble codes, messages addressed to it."""
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+import pytest
+from msgspec import structs
+
 from level1.catalog import Alarm
 from level1.command import Order
 from level1.event import Event, Monitor, Output, Result, Send
 from level1.expression import Boolean
-from level1.frame import EXTENDED, Frame
+from level1.frame import BUS_SHIFT, EXTENDED, Frame
+from level1.gate import BURST, Refused
 from level1.j1939 import parse_dm1
 from level1.j1939_node import name_of
+from level1.memory import State
+from level1.subsystems import QUIET_NS
 from level1.supervisor import Supervisor
 from level1.tests.build import MS, SECOND, alarm, catalog, compare, message, signal
 from level1.tests.test_j1939 import broadcast, dtc
@@ -19,8 +27,8 @@ LOW, LOWER = (alarm(name, compare("TANK.Level", "<", limit), code, spn=spn, fmi=
               (("Low", 20, 1, 96, 18, "Low"), ("Lower", 10, 2, 0x7A001, 1, "Critical")))
 
 
-def supervisor(*alarms: Alarm, address: int = 0x80) -> Supervisor:
-    return Supervisor(catalog([TANK], [*alarms, *CONFLICT]), unit="tractor-7", start_ns=0, j1939={0: address})
+def supervisor(*alarms: Alarm, address: int = 0x80, restored: State | None = None) -> Supervisor:
+    return Supervisor(catalog([TANK], [*alarms, *CONFLICT]), unit="tractor-7", start_ns=0, j1939={0: address}, restored=restored)
 
 
 def sent(outputs: list[Output], pgn: int) -> list[Send]:
@@ -110,11 +118,73 @@ def test_a_message_sent_to_it_is_granted_window_by_window_and_acknowledged() -> 
     assert len(target._reported["TroubleCode"]) == 40
 
 
+def told(outputs: Iterable[Output]) -> list[tuple[float, str, str]]:
+    return [(float(out.t), out.alarm, out.event) for out in outputs if isinstance(out, Event)]
+
+
 def test_someone_elses_frame_under_an_own_identifier_is_told() -> None:
     target = supervisor(LOW)
     target.tick(SECOND)
     outputs = target.receive_many([Frame(SECOND, 0x650, bytes(8)), Frame(SECOND, 0x18FF0080 | EXTENDED, bytes(8))])
     assert [out.alarm for out in outputs if isinstance(out, Event)] == ["SecondTalker", "AddressConflict"]
+
+
+STRANGE = {"SecondTalker": 0x650, "AddressConflict": 0x18FF0080 | EXTENDED}
+
+
+@pytest.mark.parametrize("alarm", STRANGE)
+def test_a_stranger_is_told_once_and_is_over_when_it_has_been_quiet(alarm: str) -> None:
+    target = supervisor(LOW)
+    target.tick(SECOND)
+    talk = [Frame(t * SECOND, STRANGE[alarm], bytes([t])) for t in range(1, 20)]
+    assert told(target.receive_many(talk)) == [(1, alarm, "raised")]
+    assert told(target.tick(60 * SECOND)) == [(19 + QUIET_NS / SECOND, alarm, "cleared")]
+    assert told(target.receive(Frame(61 * SECOND, STRANGE[alarm], b"")))[0] == (61, alarm, "raised"), "the same again"
+
+
+@pytest.mark.parametrize("alarm", STRANGE)
+def test_a_stranger_of_an_earlier_boot_is_over_unless_it_still_talks(alarm: str) -> None:
+    before = supervisor(LOW)
+    before.tick(SECOND)
+    before.receive(Frame(SECOND, STRANGE[alarm], b""))
+    quiet, talking = (supervisor(LOW, restored=before.state()) for _ in range(2))
+    assert told(quiet.tick(20 * SECOND)) == [(QUIET_NS / SECOND, alarm, "cleared")]
+    talking.tick(0)
+    assert told(talking.receive_many(Frame(t * SECOND, STRANGE[alarm], b"") for t in range(1, 20))) == []
+    assert told(talking.tick(60 * SECOND)) == [(19 + QUIET_NS / SECOND, alarm, "cleared")]
+
+
+def test_a_node_that_was_there_before_the_address_was_claimed_is_noticed_as_well() -> None:
+    target = supervisor(LOW)
+    target.tick(0)
+    early = [Frame(t, 0x18FF0081 | EXTENDED, b"") for t in range(10)]
+    assert told(target.receive_many(early)) == []
+    target.receive(claim(100 * MS, 0x80, bytes(8)))
+    target.tick(SECOND)
+    outputs = target.receive(Frame(SECOND, 0x18FF0081 | EXTENDED, b""))
+    assert told(outputs) == [(1, "AddressConflict", "raised")]
+    assert [send.key & 0xFF for send in sent(list(outputs), 0xEE00)] == [0x81], "it is told whose the address is"
+
+
+def test_a_node_sends_no_group_but_those_of_its_protocols() -> None:
+    gate = supervisor(LOW).gate
+    for key, allowed in ((0x18FECA80, True), (0x18EAFF80, True), (0x18FEF180, False), (0x0CFE6E80, False), (0x1CEBFF80, True)):
+        send = Send(0, key | EXTENDED, bytes(8), "a frame", "J1939", SECOND)
+        for where in (send, structs.replace(send, key=send.key | 1 << BUS_SHIFT)):
+            try:
+                gate.check_protocol(where)
+            except Refused as refusal:
+                assert "is not on the list" in str(refusal) and not (allowed and where is send)
+            else:
+                assert allowed and where is send, "the UCS has an address on that bus only"
+
+
+def test_frames_of_a_protocol_have_a_limit_too() -> None:
+    target = supervisor(LOW)
+    target.tick(SECOND)
+    request = Frame(SECOND, 0x18EAFF22 | EXTENDED, bytes([0x00, 0xEE, 0x00]))
+    assert len(sent(target.receive_many([request] * 1000), 0xEE00)) == BURST
+    assert target.counters["frames refused by the gate"] == 1000 - BURST
 
 
 def test_stored_codes_are_asked_for_and_told() -> None:
