@@ -1,0 +1,173 @@
+"""A CAN adapter on a serial line: `ucs run` by python-can's slcan over a pty; unplugged, plugged again, noisy, hanging."""
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from level1.decode import encode
+from level1.event import Event
+from level1.io.definitions import load
+from level1.io.journal import read_events
+from level1.tests.lawicel import Adapter
+from ucs.main import main
+
+UNIT = """
+[unit]
+name = "tractor-7"
+[[bus]]
+name = "implement"
+interface = "slcan"
+channel = "{channel}"
+bitrate = 250000
+dbc = ["ucs.dbc", "flaming_tool.dbc"]
+options = {{ sleep_after_open = 0.0 }}
+[repairs]
+armed = ["PilotFlameOut"]
+[journal]
+path = "journal.db"
+"""
+WAIT_S = 20.0
+IN_TIME_S = 1.0
+STATUS = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
+ALARMS, COMMAND = "t650", "t110"
+
+
+@pytest.fixture
+def adapter(tmp_path: Path) -> Iterator[Adapter]:
+    one = Adapter(tmp_path / "ttyCAN")
+    (tmp_path / "unit.toml").write_text(UNIT.format(channel=one.path))
+    yield one
+    one.stop()
+
+
+@pytest.fixture
+def story(adapter: Adapter, tmp_path: Path) -> Iterator[Callable[[Callable[[], None]], list[Event]]]:
+    """Runs `ucs run` in this process while the story is told by a thread; gives the events of its journal."""
+    failed: list[BaseException] = []
+    telling: list[threading.Thread] = []
+
+    def tell(it: Callable[[], None]) -> list[Event]:
+        def work() -> None:
+            try:
+                wait_for(lambda: any(line.startswith(ALARMS) for line in adapter.sent))
+                it()
+            except BaseException as error:
+                failed.append(error)
+            finally:
+                os.kill(os.getpid(), signal.SIGTERM)
+        telling.append(threading.Thread(target=work))
+        telling[-1].start()
+        assert main(["run", str(tmp_path / "unit.toml")]) == 0
+        telling[-1].join()
+        if failed:
+            raise failed[0]
+        return list(read_events(tmp_path / "journal.db"))
+    yield tell
+
+
+def wait_for(happened: Callable[[], object], within_s: float = WAIT_S) -> float:
+    """Until something has happened; gives how many seconds it took."""
+    begin = time.monotonic()
+    while not happened():
+        assert time.monotonic() < begin + within_s, "it did not happen"
+        time.sleep(0.005)
+    return time.monotonic() - begin
+
+
+def flame(adapter: Adapter, alight: bool, seconds: float) -> None:
+    """What a flaming tool says for a while."""
+    end = time.monotonic() + seconds
+    counter = 0
+    while time.monotonic() < end:
+        adapter.hear(STATUS.can_id, encode(STATUS, {"Flaming": 1, "PilotFlame": alight, "AliveCounter": counter % 4}, None))
+        counter += 1
+        time.sleep(0.05)
+
+
+def told(events: list[Event], alarm: str) -> list[str]:
+    return [event.event for event in events if event.alarm == alarm]
+
+
+def state(adapter: Adapter, alarm: str) -> int:
+    """What the last alarm message of UCS_ALARMS on the adapter's bus says."""
+    message = load(["ucs.dbc"]).messages["UCS_ALARMS"]
+    line = next((line for line in reversed(adapter.sent) if line.startswith(f"T{message.can_id:08X}")), "")
+    place = message.signal(alarm).start
+    return int.from_bytes(bytes.fromhex(line[10:]), "little") >> place & 3
+
+
+def test_a_unit_is_supervised_and_commanded_through_it(
+        adapter: Adapter, story: Callable[[Callable[[], None]], list[Event]]) -> None:
+    def it() -> None:
+        flame(adapter, False, 1.0)
+        wait_for(lambda: any(line.startswith(COMMAND) for line in adapter.sent))
+    events = story(it)
+    assert told(events, "PilotFlameOut")[:2] == ["raised", "repair_started"]
+    assert not told(events, "CanBusDown")
+
+
+def test_unplugged_it_is_an_alarm_in_time_and_plugged_again_it_works_without_a_restart(
+        adapter: Adapter, story: Callable[[Callable[[], None]], list[Event]], capsys: pytest.CaptureFixture[str]) -> None:
+    pulled: list[float] = []
+
+    def it() -> None:
+        for _ in range(2):
+            pulled.append(time.monotonic())
+            adapter.unplug()
+            time.sleep(IN_TIME_S)
+            adapter.sent.clear()
+            adapter.plug()
+            wait_for(lambda: any(line.startswith(ALARMS) for line in adapter.sent))
+            wait_for(lambda: not state(adapter, "CanBusDown"))
+        flame(adapter, False, 1.0)
+        wait_for(lambda: any(line.startswith(COMMAND) for line in adapter.sent))
+    events = story(it)
+    down = [event for event in events if event.alarm == "CanBusDown"]
+    assert [event.event for event in down] == ["raised", "cleared"] * 2
+    for event, pulled_s in zip(down[::2], pulled, strict=True):
+        assert float(event.t) - pulled_s < IN_TIME_S
+    for raised, cleared in zip(down[::2], down[1::2], strict=True):
+        assert cleared.values["AwaySeconds"] == pytest.approx(float(cleared.t - raised.t), abs=0.01)
+    assert told(events, "PilotFlameOut")[:2] == ["raised", "repair_started"]
+    notices = capsys.readouterr().err
+    assert notices.count("trying again") == notices.count("back after") == 2
+
+
+def test_noise_and_half_lines_are_counted_and_what_follows_is_read(
+        adapter: Adapter, story: Callable[[Callable[[], None]], list[Event]], capsys: pytest.CaptureFixture[str]) -> None:
+    def it() -> None:
+        for noise in (b"\xff\xfe\x80\r", b"t21", b"t2108ZZ\r", b"T1F\r", b"t\r", b"\r\r\a\r", b"x\r"):
+            adapter.write(noise)
+            time.sleep(0.02)
+        flame(adapter, False, 1.0)
+        wait_for(lambda: any(line.startswith(COMMAND) for line in adapter.sent))
+    events = story(it)
+    assert told(events, "PilotFlameOut")[:2] == ["raised", "repair_started"]
+    assert not told(events, "CanBusDown")
+    assert " impossible" in capsys.readouterr().out
+
+
+def test_one_that_hangs_does_not_hold_supervision_and_is_told(
+        adapter: Adapter, story: Callable[[Callable[[], None]], list[Event]]) -> None:
+    def it() -> None:
+        adapter.hang()
+        flame(adapter, False, 2.0)
+        adapter.sent.clear()
+        adapter.drains = True
+        wait_for(lambda: state(adapter, "SendFailed"))
+        begin.append(time.monotonic())
+        wait_for(lambda: not state(adapter, "SendFailed"))
+    begin: list[float] = []
+    events = story(it)
+    raised = {event.alarm: event for event in events if event.event == "raised"}
+    assert {"PilotFlameOut", "SendFailed"} <= raised.keys() and "CanBusDown" not in raised
+    assert float(raised["PilotFlameOut"].t) < begin[0], "supervision went on meanwhile"
+    assert told(events, "SendFailed") == ["raised", "cleared"]
+    lost = next(event for event in events if (event.alarm, event.event) == ("SendFailed", "cleared")).values["NotSent"]
+    assert lost["FLAMER_CMD"] > 0 and lost["UCS_ALARMS"] > 0
