@@ -6,6 +6,7 @@ stop, their valves close, and they resume when it is back. Frames that nobody co
 from __future__ import annotations
 
 import errno
+from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
@@ -42,11 +43,12 @@ class LiveBus:
 
     open_bus: opens it, as `can.Bus` does. name: what to call it in a message. patience_ns: a lost bus may stay away so long.
     tell(t_ns, text): what happens to the bus. frames: sent and heard; dropped: not sent because a queue was full.
+    echoes: one hears one's own frames there (udp_multicast), as on no CAN controller; they are left out.
     """
 
     def __init__(self, open_bus: Callable[[], can.BusABC], name: str, participants: Iterable[Participant], clock: Clock,
                  tell: Callable[[int, str], None], *, patience_ns: int, on_frame: FrameListener | None = None,
-                 on_happening: StoryListener | None = None):
+                 on_happening: StoryListener | None = None, echoes: bool = False):
         self.frames = 0
         self.dropped = 0
         self._open_bus = open_bus
@@ -58,6 +60,7 @@ class LiveBus:
         self._patience_ns = patience_ns
         self._on_frame = on_frame
         self._on_happening = on_happening
+        self._own: deque[BusFrame] = deque(maxlen=BATCH if echoes else 0)
         self._bus: can.BusABC | None = None
         self._lost_ns: int | None = None
         self._retry_ns = 0
@@ -115,6 +118,9 @@ class LiveBus:
                 wait_ns = 0
                 if not (message.is_error_frame or message.is_remote_frame or message.is_fd):
                     frame = BusFrame(message.arbitration_id, message.is_extended_id, bytes(message.data))
+                    if frame in self._own:
+                        self._own.remove(frame)
+                        continue
                     self._hear(self._clock.now_ns(), frame, None)
         except (can.CanError, OSError) as error:
             self._lose(error)
@@ -130,6 +136,7 @@ class LiveBus:
             else:
                 self._lose(error)
             return False
+        self._own.append(frame)
         if self._lost_ns is not None:
             self._tell(now_ns, f"bus {self._name} is back")
             self._lost_ns = None

@@ -101,7 +101,7 @@ class Attendant:
 
     def _look(self, live: Live, journal: Journal, sources: Sources, fleet: str) -> RunStanding:
         supervisor, now_ns = live.supervisor, self._clock()
-        active = sorted(supervisor.active(), key=_gravest)
+        active = sorted(supervisor.active(), key=gravest)
         repairable = [name for name, alarm in supervisor.catalog.alarms.items() if alarm.repair]
         armed = supervisor.armed if supervisor.armed is not None else repairable
         is_armed = {name: name in armed or name.partition("@")[0] in armed for name in repairable}
@@ -109,7 +109,7 @@ class Attendant:
         return RunStanding(
             unit=supervisor.unit, fleet=fleet, version=version(), pid=os.getpid(), boot=supervisor.boot, seq=supervisor.seq,
             uptime_s=(now_ns - self._begun_ns) / 1e9, turn_age_s=0.0, lateness_s=max(self._lateness) / 1e9, mode=supervisor.mode,
-            utc_trusted=supervisor.utc_trusted, buses=tuple(self._bus(port, now_ns) for port in live.ports),
+            utc_trusted=supervisor.utc_trusted, buses=tuple(bus_standing(port, now_ns, port.state) for port in live.ports),
             alarms=tuple(self._alarm(machine, repair, now_ns, is_armed.get(machine.definition.name, True))
                          for machine, repair in active[:LISTED]),
             hidden=max(0, len(active) - LISTED), defined=len(supervisor.catalog.alarms),
@@ -119,13 +119,6 @@ class Attendant:
             gnss=None if gnss is None else _gnss(gnss), recorder=None if recorder is None else str(recorder.folder),
             recorder_fault=recorder and recorder.fault or "", recorder_dropped=recorder.dropped if recorder else 0,
             counters=dict(supervisor.counters))
-
-    def _bus(self, port: Port, now_ns: int) -> BusStanding:
-        settings, last_ns = port.settings, port.last_ns
-        return BusStanding(
-            name=settings.name, interface=settings.interface, channel=settings.channel, state=port.state, received=port.received,
-            sent=port.counters["sent"], quiet_s=None if last_ns is None else max(0.0, (now_ns - last_ns) / 1e9),
-            load_percent=port.load_percent, counters=dict(port.counters))
 
     def _alarm(self, machine: AlarmMachine, repair: RepairMachine | None, now_ns: int, armed: bool) -> AlarmStanding:
         raised_ns = self._raised_ns.get(machine.instance)
@@ -148,7 +141,16 @@ class Attendant:
         return encode(msgspec.structs.replace(answer, turn_age_s=max(0.0, (self._clock() - self._turned_ns) / 1e9)))
 
 
-def _gravest(found: tuple[AlarmMachine, RepairMachine | None]) -> tuple[int, int]:
+def bus_standing(port: Port, now_ns: int, state: str) -> BusStanding:
+    """A bus as a standing. state: a word of `health.BUS_STATES`."""
+    settings, last_ns = port.settings, port.last_ns
+    return BusStanding(
+        name=settings.name, interface=settings.interface, channel=settings.channel, state=state, received=port.received,
+        sent=port.counters["sent"], quiet_s=None if last_ns is None else max(0.0, (now_ns - last_ns) / 1e9),
+        load_percent=port.load_percent, counters=dict(port.counters))
+
+
+def gravest(found: tuple[AlarmMachine, RepairMachine | None]) -> tuple[int, int]:
     """Sorts the gravest first, then the newest."""
     return -PRIORITIES.index(found[0].definition.priority), -found[0].instance
 

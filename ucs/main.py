@@ -39,6 +39,7 @@ GROUPS = {
     },
     "on the tractor": {
         "run": Command("ucs.run", "supervise a unit live"),
+        "monitor": Command("ucs.monitor", "watch alarms, repairs, signals and buses live in the terminal"),
         "status": Command("ucs.status", "how a unit is, once: for people and monitoring systems"),
         "journal": Command("ucs.journal", "list, follow and export what happened"),
         "bridge": Command("ucs.bridge", "carry a unit's events to level 2 and commands back"),

@@ -200,7 +200,7 @@ def _run_live(args: argparse.Namespace, scenario: Scenario, cast: Cast, on_frame
     tell = _teller(sys.stdout, flush=True)
     bus = LiveBus(lambda: can.Bus(**options), name, cast.participants, clock,
                   lambda t_ns, text: tell(Happening(t_ns, "bus", text)), patience_ns=_duration("--patience", args.patience),
-                  on_frame=on_frame, on_happening=tell)
+                  on_frame=on_frame, on_happening=tell, echoes=args.interface == "udp_multicast")
     try:
         with _terminable():
             bus.run(scenario.duration_ns)

@@ -119,6 +119,21 @@ def test_frames_of_others_reach_the_nodes_and_odd_ones_do_not() -> None:
     assert live.tool._commanded_ns is not None
 
 
+@pytest.mark.parametrize(("echoes", "count"), [(True, 1), (False, 2)])
+def test_where_one_hears_oneself_each_own_frame_counts_once(echoes: bool, count: int) -> None:
+    class Mirror(Wire):
+        def send(self, msg: can.Message, timeout: float | None = None) -> None:
+            super().send(msg)
+            self.incoming.append(msg)
+
+    live = Live(alone=True)
+    heard: list[int] = []
+    bus = LiveBus(lambda: Mirror(live.clock), "test0", [live.tool], live.clock, lambda t_ns, text: None, patience_ns=SECOND,
+                  on_frame=lambda t_ns, frame: heard.append(frame.can_id), echoes=echoes)
+    bus.run(SECOND)
+    assert heard.count(0x210) // 10 == count
+
+
 def _loaded(clock: Clock, messages: list[can.Message]) -> Wire:
     wire = Wire(clock)
     wire.incoming += messages

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 
 import can
@@ -33,10 +34,21 @@ CLOSE_S = 0.2
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 
-class PythonCan:
-    """An open interface. bus: of python-can. impossible: frames that can't be. lost: frames the driver told to have dropped."""
+ECHOES = ("udp_multicast",)
+"""Interfaces on which one hears oneself, which no CAN controller does."""
+ECHO_NS = 500_000_000
+"""An echo that has not come by then was lost."""
 
-    def __init__(self, bus: can.BusABC, clock: Callable[[], int], wall: Callable[[], int]):
+
+class PythonCan:
+    """An open interface. bus: of python-can. impossible: frames that can't be. lost: frames the driver told to have dropped.
+
+    echoes: one hears one's own frames there; they are left out, else the UCS would be taken for a second talker.
+    """
+
+    def __init__(self, bus: can.BusABC, clock: Callable[[], int], wall: Callable[[], int], *, echoes: bool = False):
+        self._own: deque[tuple[int, int, bytes]] | None = deque() if echoes else None
+        self._again = False
         self.impossible = self.lost = 0
         self.last_ns: int | None = None
         self._bus, self._clock, self._wall, self._stamps = bus, clock, wall, Stamps()
@@ -58,6 +70,8 @@ class PythonCan:
             self.impossible += 1
             return []
         t_ns = self._stamps.monotonic_ns(int(message.timestamp * 1e9), self._clock(), self._wall(), self._clock())
+        if self._own is not None and self._is_echo(key, data):
+            return []
         frame = Frame(t_ns, key | bus << BUS_SHIFT, data)
         if key & ERROR:
             self._errors.append(frame)
@@ -76,6 +90,19 @@ class PythonCan:
         self._bus.flush()  # what it can't read it would keep, and try again with all that follows
         return None
 
+    def _is_echo(self, key: int, data: bytes) -> bool:
+        """Whether it is one of the frames sent lately; an interface may drop some of them, but keeps their order."""
+        assert self._own is not None
+        late_ns = self._clock() - ECHO_NS
+        while self._own and self._own[0][0] < late_ns:
+            self._own.popleft()
+        for position, (_, sent_key, sent_data) in enumerate(list(self._own)):
+            if (sent_key, sent_data) == (key, data):
+                for _ in range(position + 1):
+                    self._own.popleft()
+                return True
+        return False
+
     def errors(self, bus: int) -> list[Frame]:
         """The error message frames since the last call."""
         errors, self._errors = self._errors, []
@@ -89,8 +116,13 @@ class PythonCan:
         is_remote = bool(key & REMOTE)
         message = can.Message(arbitration_id=key & 0x1FFFFFFF, is_extended_id=bool(key & EXTENDED), is_remote_frame=is_remote,
                               dlc=len(data), data=None if is_remote else data, is_fd=len(data) > CLASSIC_BYTES)
+        if self._own is not None and not self._again:
+            self._own.append((self._clock(), key & ~(-1 << BUS_SHIFT), b"" if is_remote else data))
+        self._again = False
         try:
-            return self._sender.send(message)
+            sent = self._sender.send(message)
+            self._again = not sent
+            return sent
         except (can.CanError, OSError, ValueError) as error:
             if _is_full(error):
                 return False
@@ -178,7 +210,7 @@ def open_interface(settings: Bus, clock: Callable[[], int], wall: Callable[[], i
     except (can.CanError, OSError, ImportError, NotImplementedError, TypeError, ValueError) as error:
         raise BusError(f"bus {settings.name}: {settings.interface} {settings.channel} can't be opened: {reason(error)}; "
                        "check the adapter, its driver and the [[bus]] table") from None
-    return PythonCan(bus, clock, wall)
+    return PythonCan(bus, clock, wall, echoes=settings.interface in ECHOES)
 
 
 def reason(error: Exception) -> str:

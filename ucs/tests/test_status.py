@@ -2,13 +2,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import signal
 import sqlite3
-import threading
-import time
-from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
 
@@ -29,6 +24,7 @@ from ucs.attendant import Attendant
 from ucs.main import main
 from ucs.standing import AlarmStanding, BridgeStanding, BusStanding, RepairStanding, RunStanding, ask_run
 from ucs.status import CRITICAL, OK, UNKNOWN, WARNING, JournalStanding, Limits, Picture, alarm_line, first_line, judge, page
+from ucs.tests.running import awaited, beside_run
 
 UNIT = """
 [unit]
@@ -128,32 +124,6 @@ def test_an_alarm_tells_what_is_done_about_it(repair: RepairStanding, text: str)
 
 
 # --- what runs or is broken -------------------------------------------------------------------------------------------------
-
-
-def beside_run(unit: Path, body: Callable[[Path], None]) -> None:
-    """`ucs run` in this thread until the body, in another, is done; what the body raises is raised."""
-    failed: list[BaseException] = []
-
-    def live() -> None:
-        try:
-            body(unit.parent / "journal.db")
-        except BaseException as error:
-            failed.append(error)
-        os.kill(os.getpid(), signal.SIGTERM)
-    thread = threading.Thread(target=live)
-    thread.start()
-    assert main(["run", str(unit)]) == 0
-    thread.join()
-    if failed:
-        raise failed[0]
-
-
-def awaited(journal: Path, enough: Callable[[RunStanding], bool] = lambda _: True) -> RunStanding:
-    stop = time.monotonic() + 20
-    while not (isinstance(told := ask_run(journal), RunStanding) and enough(told)):
-        assert time.monotonic() < stop, told
-        time.sleep(0.05)
-    return told
 
 
 def test_a_running_unit_tells_its_alarm_and_the_step_of_its_repair(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
