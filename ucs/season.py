@@ -26,7 +26,7 @@ from level1.event import Event, decode, encode
 from level1.io.error import OutsideError
 from level1.io.replay import Log
 
-SUFFIXES = (".log", ".candump", ".txt", ".asc", ".blf", ".trc", ".csv", ".mf4", ".pcap", ".pcapng")
+SUFFIXES = (".log", ".candump", ".txt", ".nmea", ".asc", ".blf", ".trc", ".csv", ".mf4", ".pcap", ".pcapng")
 """What counts as a recording in a folder, each also with `.gz`."""
 
 

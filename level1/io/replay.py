@@ -3,7 +3,8 @@
 candump text (the log form of `candump -l`/`-L` and the screen form with time stamps) and SavvyCAN's GVRET text are read
 here, because their decimal stamps must become exactly as many nanoseconds; BLF, MF4 and pcap by readers of their own
 (`blf_blocks`, `mf4_blocks`, `pcap_blocks`), which read many frames at a time. ASC and TRC go through python-can's readers,
-whose floating-point stamps are rounded to the microsecond (all they hold at today's epoch).
+whose floating-point stamps are rounded to the microsecond (all they hold at today's epoch). NMEA 0183 text of a GNSS receiver
+becomes the frames that the UCS makes of it (`nmea_log`).
 
 Nothing in a file stops the reading for good: a line that can't be read is skipped, counted and told. Stamps that run
 backwards are handed on as they stand; the supervisor clamps and counts them.
@@ -19,6 +20,7 @@ import zlib
 from binascii import unhexlify
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     import can
 
     from level1.block import Block
+    from level1.catalog import Catalog
 
 TOLD_LINES = 3
 """How many unreadable lines are told in words; all are counted."""
@@ -49,7 +52,14 @@ _ASC_FRAME = re.compile(r"\s*\d+\.\d+\s")
 _GVRET_HEAD = re.compile(rb"Time Stamp,ID,Extended,(Dir,)?Bus,LEN\b")
 _SUFFIXES = (".asc", ".blf", ".csv", ".mf4", ".trc")
 _PCAP = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\x0a\x0d\x0d\x0a")
-_HINT = "known: candump text, .asc, .blf, .csv, .mf4, .pcap, .trc, also with .gz"
+_HINT = "known: candump text, .asc, .blf, .csv, .mf4, .pcap, .trc, NMEA 0183 text of a GNSS receiver, also with .gz"
+
+
+@cache
+def _own_messages() -> Catalog:
+    """What the UCS says of itself."""
+    from level1.io.definitions import load
+    return load(["ucs.dbc"])
 
 
 class LogError(OutsideError):
@@ -225,7 +235,15 @@ class Log:
         if any(map(is_candump, head.splitlines())):
             self._columns = self._candump_blocks
             return self._candump
+        from level1.io.nmea_log import is_nmea  # a parser of its own, only for what is nothing else
+        if is_nmea(head):
+            return self._nmea
         raise LogError(f"{self.path}: no recording of a known format; {_HINT}")
+
+    def _nmea(self) -> Iterator[Frame]:
+        """What a GNSS receiver said, as the frames of the shipped `ucs.dbc`."""
+        from level1.io.nmea_log import frames
+        return frames(self._file.read(), _own_messages(), self.bus("gnss"))
 
     def _skip(self, reason: str) -> None:
         self.skipped += 1

@@ -229,8 +229,47 @@ def with_wild_samples(frames: Frames, chance: random.Random) -> Frames:
             else (t, key, data) for t, key, data in frames]
 
 
-@pytest.mark.parametrize("mishap", [half_lost, begun_late, ended_early, with_a_gap, paused, with_wild_samples])
-@pytest.mark.parametrize("name", [name for name in LOGS if name not in FAULTS])
+def doubled(frames: Frames, chance: random.Random) -> Frames:
+    """Two adapters on one bus: one frame in ten comes twice."""
+    return [frame for frame in frames for _ in range(1 + (chance.random() < 0.1))]
+
+
+def reordered(frames: Frames, chance: random.Random) -> Frames:
+    """One frame in twenty changes places with one of the next four."""
+    mixed = list(frames)
+    for _ in range(len(mixed) // 20):
+        here = chance.randrange(len(mixed))
+        there = min(here + chance.randint(1, 4), len(mixed) - 1)
+        mixed[here], mixed[there] = mixed[there], mixed[here]
+    return mixed
+
+
+def set_back(frames: Frames, chance: random.Random) -> Frames:
+    """The clock of the recorder is set back at some moment."""
+    when, by = chance.randrange(len(frames)), chance.randint(1, 100) * S
+    return [(t - by if number > when else t, key, data) for number, (t, key, data) in enumerate(frames)]
+
+
+def in_bursts(frames: Frames, chance: random.Random) -> Frames:
+    """The adapter hands frames over every 0.3 s, with the time of the handing over."""
+    return [(t // (300 * S // 1000) * (300 * S // 1000), key, data) for t, key, data in frames]
+
+
+def shortened(frames: Frames, chance: random.Random) -> Frames:
+    """One payload in two hundred is cut (not those of trouble codes)."""
+    return [(t, key, data[:chance.randrange(len(data) + 1)]) if chance.random() < 0.005 and not is_from((t, key, data), 65226)
+            else (t, key, data) for t, key, data in frames]
+
+
+MISHAPS = (half_lost, begun_late, ended_early, with_a_gap, paused, with_wild_samples)
+RARE_MISHAPS = (doubled, reordered, set_back, in_bursts, shortened)
+"""Each over every third recording."""
+HEALTHY = [name for name in LOGS if name not in FAULTS]
+
+
+@pytest.mark.parametrize(("name", "mishap"), [
+    *((name, mishap) for mishap in MISHAPS for name in HEALTHY),
+    *((name, mishap) for number, mishap in enumerate(RARE_MISHAPS) for name in HEALTHY[number % 3::3])])
 def test_a_mishap_of_the_recording_raises_nothing(
         catalog: Catalog, name: str, mishap: Callable[[Frames, random.Random], Frames]) -> None:
     frames = mishap(frames_of(name), random.Random(f"{name} {mishap.__name__}"))
