@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from benchmarks import powercut
+from benchmarks import nats, powercut
 from benchmarks.chain import peak_kb
 from bridge import wire
 from bridge.gate import Gate, Passed, Refused
@@ -45,12 +45,12 @@ class Row(NamedTuple):
     good: bool
 
 
-def kill_processes(events: int, dice: random.Random) -> Row:
+def kill_processes(events: int, dice: random.Random, nats_server: str = "") -> Row:
     """SIGKILL to unit, bridge, broker and receiver in any order while events flow."""
     kills: Counter[str] = Counter()
     with tempfile.TemporaryDirectory(prefix="soak-") as name:
         folder = Path(name)
-        chain = Chain(folder, pause_s=0.003)
+        chain = Chain(folder, 0.003, nats_server)
         try:
             eventually(lambda: chain.stored() > 0, lambda: chain.log("level2"))
             while chain.stored() < events:
@@ -76,10 +76,22 @@ def kill_processes(events: int, dice: random.Random) -> Row:
     identities = {(event.boot, event.seq) for event in found}
     missing, doubled = len(promised - identities), len(found) - len(identities)
     killed = ", ".join(f"{name} {count}" for name, count in sorted(kills.items()))
-    return Row("SIGKILL of unit, bridge, broker, receiver in any order",
+    return Row(f"SIGKILL of unit, bridge, broker{' (NATS)' * bool(nats_server)}, receiver in any order",
                f"{sum(kills.values())} kills ({killed}), {len(written)} events",
                f"{missing} lost, {doubled} doubled, {conflicts} identities given twice",
                found == written and not missing and not doubled and not conflicts and not lost)
+
+
+def kill_processes_on_nats(events: int, dice: random.Random) -> Row:
+    """The same with NATS, through its MQTT listener, as the broker."""
+    return kill_processes(events, dice, nats.server())
+
+
+def try_nats(_: int, dice: random.Random) -> Row:
+    """The bridge's tests with NATS as the broker."""
+    passed, bad, _text = nats.run_tests(nats.server())
+    return Row("NATS as the broker, through its MQTT listener, with and without mutual TLS", f"{passed + bad} tests of the bridge",
+               f"{bad} failed", passed > 0 and not bad)
 
 
 def kill_writer(kills: int, dice: random.Random) -> Row:
@@ -220,7 +232,8 @@ def main() -> int:
     share = 10 if args.quick else 1
     dice = random.Random(args.seed)
     trials: list[tuple[Callable[[int, random.Random], Row], int]] = [
-        (kill_writer, 1000), (forge_commands, 100_000), (cut_power, 20), (kill_processes, 10_000)]
+        (kill_writer, 1000), (forge_commands, 100_000), (cut_power, 20), (kill_processes, 10_000),
+        (try_nats, 0), (kill_processes_on_nats, 2_000)]
     rows: list[Row] = []
     for trial, count in trials:
         print(f"{trial.__name__.replace('_', ' ')}", flush=True)

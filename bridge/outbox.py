@@ -151,8 +151,7 @@ class Outbox:
 
     def waiting(self) -> int:
         """Events of the journal and beside it that level 2 has not acknowledged; an upper bound where seqs are lost."""
-        boots = self._journal.boots()
-        total = sum(self._journal.last_seq(boot) - self._delivered.of(boot).count() for boot in boots)
+        total = sum(last - self._delivered.of(boot).count() for boot, last in self._journal.last_seqs().items())
         return max(0, total) + sum(1 for position in self._unjournaled if position > self._journal.last())
 
     @property

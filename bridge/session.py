@@ -5,7 +5,9 @@ due time, then sends what the `Outbox` says. It may be killed at any moment: wha
 """
 from __future__ import annotations
 
+import hashlib
 import random
+import re
 import select
 import threading
 from collections import Counter
@@ -71,6 +73,17 @@ class Settings(msgspec.Struct, frozen=True):
     window: int = WINDOW
     retry_ns: int = RETRY_NS
     backlog_per_s: float = BACKLOG_PER_S
+
+
+def client_id(settings: Settings) -> str:
+    """The same at every start, so that a new connection ends an old one that nobody closed, whose last will would else come later.
+    Another unit can't guess it, where there is a private key, and so can't push this one out. NATS takes no points in it.
+    """
+    secret = b""
+    with suppress(OSError):
+        secret = Path(settings.tls.key).read_bytes() if settings.tls.key else b""
+    mark = hashlib.sha256(b"\n".join([settings.fleet.encode(), settings.unit.encode(), secret])).hexdigest()[:16]
+    return f"ucs-{re.sub('[^A-Za-z0-9-]', '_', settings.unit)}-{mark}"
 
 
 class Bridge:
@@ -213,8 +226,8 @@ class Bridge:
         subscribe = [(self._topic("ack"), 1), (self._topic("command"), 1)]
         will = (self._topic("connection"), wire.encode(self._connection_message("CONNECTION_BROKEN")))
         try:
-            self._connection = MqttConnection(settings.broker, f"ucs-{settings.fleet}-{settings.unit}", subscribe=subscribe,
-                                              will=will, tls=settings.tls)
+            self._connection = MqttConnection(settings.broker, client_id(settings), subscribe=subscribe, will=will,
+                                              tls=settings.tls)
         except MqttError as error:
             self._say_once("broker", f"{error} (the bridge keeps trying, the journal keeps the events)")
             self._connect_later()

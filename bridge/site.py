@@ -1,12 +1,14 @@
-"""A test site: mosquitto's configuration with mutual TLS and rights for each unit, and all certificates it takes.
+"""A test site: configurations of mosquitto and NATS with mutual TLS and rights for each unit, and all certificates it takes.
 
 For trials and as a pattern. A real site keeps its authority's key off the broker and renews certificates by its own rules.
 """
 from __future__ import annotations
 
 import ipaddress
+import json
 import os
 import pwd
+import re
 import shutil
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
@@ -23,6 +25,7 @@ from level1.io.error import OutsideError
 VALID = timedelta(days=825)
 LEVEL2 = "level2"
 BROKER = "broker"
+_PLAIN = re.compile(r"[\w.-]+")
 RESERVED = (LEVEL2, BROKER, "ca", "crl")
 KEY = "-key"
 """Ends the name of the file of a private key."""
@@ -65,6 +68,30 @@ topic read {root}/+/result
 topic write {root}/+/ack
 topic write {root}/+/command
 """
+
+NATS = """\
+# NATS with its MQTT listener: the same certificates, the same rights. For a fleet beyond one machine add a `cluster` to it.
+# Start: nats-server -c {folder}/nats.conf
+# It reads no revocation list: take a user out and send SIGHUP, and that certificate comes in no more.
+listen: "127.0.0.1:{inner}"
+server_name: "{fleet}"
+jetstream {{ store_dir: "{folder}/jetstream" }}
+mqtt {{
+  listen: "0.0.0.0:{port}"
+  tls {{
+    cert_file: "{folder}/broker.pem"
+    key_file: "{folder}/broker-key.pem"
+    ca_file: "{folder}/ca.pem"
+    verify_and_map: true
+    min_version: "1.2"
+  }}
+}}
+authorization {{ users: [
+{users}
+] }}
+"""
+NATS_PORT = 4222
+"""For programs of the operator that speak NATS itself; on this machine only."""
 
 
 class SiteError(OutsideError):
@@ -121,16 +148,19 @@ class Authority:
                 .serial_number(x509.random_serial_number()).not_valid_before(begin).not_valid_after(self._now + valid))
 
 
-def make_site(folder: Path, fleet: str, units: Sequence[str], hosts: Sequence[str], port: int = 8883) -> Authority:
+def make_site(folder: Path, fleet: str, units: Sequence[str], hosts: Sequence[str], port: int = 8883,
+              inner: int = NATS_PORT) -> Authority:
     """Write a site into a new folder; gives its authority. Raises SiteError.
 
-    mosquitto.conf, acl, ca.pem, ca-key.pem, crl.pem, broker.pem, level2.pem, a certificate a unit, and the key of each.
+    mosquitto.conf, acl, nats.conf, ca.pem, ca-key.pem, crl.pem, broker.pem, level2.pem, a certificate a unit, and the key of each.
     """
     for name in (fleet, *units):
         try:
             wire.check_name(name, "fleet" if name == fleet else "unit")
         except wire.WireError as error:
             raise SiteError(str(error)) from None
+        if not _PLAIN.fullmatch(name):
+            raise SiteError(f'"{name}": configurations of brokers take letters, digits, "-", "_" and "." in names')
         if name in units and (name in RESERVED or name.endswith(KEY)):
             raise SiteError(f'unit "{name}": the site has a file of that name itself; call the unit otherwise')
     folder = folder.absolute()
@@ -146,6 +176,8 @@ def make_site(folder: Path, fleet: str, units: Sequence[str], hosts: Sequence[st
         (folder / "acl").write_text(RIGHTS.format(root=root, level2=LEVEL2), encoding="utf-8")
         (folder / "mosquitto.conf").write_text(CONFIGURATION.format(folder=folder, port=port, payload=wire.PAYLOAD_BYTES),
                                                encoding="utf-8")
+        (folder / "nats.conf").write_text(NATS.format(folder=folder, port=port, inner=inner, fleet=fleet,
+                                                      users=_nats_users(fleet, units)), encoding="utf-8")
         _let_mosquitto_read(folder)
     except FileExistsError:
         raise SiteError(f"site {folder}: exists already; name a new folder") from None
@@ -159,6 +191,22 @@ def write_private(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
     text = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
         file.write(text)
+
+
+def _nats_users(fleet: str, units: Sequence[str]) -> str:
+    """The rights that mosquitto's file gives, in subjects: topics with `.` for `/`, and what each MQTT session needs itself."""
+    def user(name: str, whose: str, kinds: Sequence[str], others: Sequence[str]) -> str:
+        publish, subscribe = ([_subject(fleet, whose, kind) for kind in each] for each in (kinds, others))
+        rights = json.dumps({"publish": publish, "subscribe": [*subscribe, "$MQTT.sub.>"]}, ensure_ascii=False)
+        return f'  {{ user: "CN={name}", permissions: {rights} }}'
+
+    return "\n".join([*(user(unit, unit, wire.UP, wire.DOWN) for unit in units), user(LEVEL2, "*", wire.DOWN, wire.UP)])
+
+
+def _subject(fleet: str, unit: str, kind: str) -> str:
+    """A topic as NATS names it: a point within a level becomes `//`."""
+    levels = [*wire.PREFIX, fleet, unit, kind, *(["*"] if kind == "monitor" else [])]
+    return ".".join(level.replace(".", "//") for level in levels)
 
 
 def _let_mosquitto_read(folder: Path) -> None:

@@ -38,7 +38,8 @@ RANGES = 64
 UP = ("connection", "monitor", "alarm", "result")
 DOWN = ("ack", "command")
 
-_FORBIDDEN = r"\s/+#\x00-\x1f\x7f-\x9f"
+_FORBIDDEN = r"\s/+#*>\x00-\x1f\x7f-\x9f"
+"""Separators and wildcards of MQTT and of NATS, and what steers a terminal."""
 _NAME = re.compile(f"[^${_FORBIDDEN}][^{_FORBIDDEN}]*")
 
 Name = Annotated[str, Meta(min_length=1, max_length=NAME_BYTES, pattern=f"^[^${_FORBIDDEN}][^{_FORBIDDEN}]*$(?!\n)")]
@@ -219,7 +220,7 @@ def check_name(name: str, what: str) -> str:
     """A name that can be one level of a topic. Raises WireError with what to write instead."""
     if not _NAME.fullmatch(name) or len(name.encode()) > NAME_BYTES:
         raise WireError(f'{what} "{name}" can\'t stand in an MQTT topic; '
-                        f'use letters, digits and "-", at most {NAME_BYTES}, no space, "/", "+", "#", and no "$" in front')
+                        f'use letters, digits and "-", at most {NAME_BYTES}, no space, none of /+#*>, and no "$" in front')
     return name
 
 

@@ -57,7 +57,7 @@ class Forwarding:
     def wait_delivered(self, timeout_s: float = 10.0) -> bool:
         """Wait until level 2 has acknowledged every event that is in the journal now."""
         with Reader(self.journal) as reader:
-            last = {boot: seq for boot in reader.boots() if (seq := reader.last_seq(boot))}
+            last = reader.last_seqs()
         delivered = delivered_path(self.journal)
 
         def arrived() -> bool:

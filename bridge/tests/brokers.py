@@ -17,7 +17,10 @@ from typing import Protocol
 from bridge.broker import EmbeddedBroker
 from bridge.mqtt import Address
 
-KINDS = ["embedded", "mosquitto", *(["nats"] if os.environ.get("NATS_SERVER") else [])]
+NATS_SERVER = os.environ.get("NATS_SERVER", "")
+SITES = ["mosquitto", *(["nats"] if NATS_SERVER else [])]
+"""Those with certificates and rights."""
+KINDS = ["embedded", *SITES]
 MOSQUITTO = "listener {port} 127.0.0.1\nallow_anonymous true\nset_tcp_nodelay true\npersistence false\n"
 NATS = 'listen: 127.0.0.1:{other}\nserver_name: test\njetstream {{ store_dir: "{folder}" }}\nmqtt {{ listen: 127.0.0.1:{port} }}\n'
 
@@ -57,7 +60,7 @@ def start(kind: str, port: int = 0) -> Broker:
     if kind == "embedded":
         return EmbeddedBroker(port=port)
     if kind == "nats":
-        return BrokerProcess(os.environ["NATS_SERVER"], NATS, port)
+        return BrokerProcess(NATS_SERVER, NATS, port)
     return BrokerProcess(mosquitto(), MOSQUITTO, port)
 
 

@@ -1,6 +1,7 @@
 """The bridge over a real broker: what leaves, what comes back, and what happens when anything in between dies."""
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,8 +11,8 @@ import pytest
 from bridge import wire
 from bridge.delivered import delivered_path, delivered_upto
 from bridge.link import RunLink
-from bridge.mqtt import Address, MqttConnection
-from bridge.session import Bridge, BridgeThread
+from bridge.mqtt import Address, MqttConnection, Tls
+from bridge.session import Bridge, BridgeThread, Settings, client_id
 from bridge.tests import brokers
 from bridge.tests.brokers import Broker
 from bridge.tests.peer import FLEET, UNIT, Peer, Unit, an_event, eventually
@@ -105,6 +106,15 @@ def test_what_the_journal_cannot_take_arrives_too(unit: Unit, peer: Peer) -> Non
         eventually(lambda: link.send_beside((an_event(2),)))
         peer.until(lambda: {1, 2} <= set(peer.seqs()))
     link.close()
+
+
+def test_no_unit_has_the_client_id_of_another_nor_can_guess_it(tmp_path: Path) -> None:
+    (tmp_path / "key.pem").write_text("secret")
+    address, key = Address("localhost", 1, True), Tls(key=str(tmp_path / "key.pem"))
+    names = [("a", "b-c", Tls()), ("a-b", "c", Tls()), ("a", "b.c", Tls()), ("a", "b-c", key)]
+    ids = [client_id(Settings(tmp_path, unit, fleet, address, tls)) for fleet, unit, tls in names]
+    assert len(set(ids)) == len(ids) and all(re.fullmatch("[A-Za-z0-9_-]+", id) for id in ids)
+    assert ids[3] == client_id(Settings(tmp_path, "b-c", "a", address, key))
 
 
 def test_a_second_bridge_on_a_journal_is_refused(unit: Unit) -> None:

@@ -1,4 +1,5 @@
-"""The site of `ucs bridge --make-site` with the real mosquitto: whom it lets in, and to what; bridge and level 2 over mTLS."""
+"""The site of `ucs bridge --make-site` with the real mosquitto (and NATS, see `brokers`): whom it lets in, and to what; bridge and
+level 2 over mutual TLS."""
 from __future__ import annotations
 
 import socket
@@ -17,7 +18,7 @@ from bridge.delivered import delivered_path, delivered_upto
 from bridge.mqtt import Address, MqttConnection, MqttError, Tls
 from bridge.session import BridgeThread
 from bridge.site import Authority, SiteError, make_site
-from bridge.tests.brokers import free_port, listens, mosquitto
+from bridge.tests.brokers import NATS_SERVER, SITES, free_port, listens, mosquitto
 from bridge.tests.peer import FLEET, UNIT, Unit, eventually
 from level1.event import seconds
 
@@ -25,19 +26,21 @@ from level1.event import seconds
 class Site:
     """A site with two units, one of them revoked, and its broker running."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, kind: str):
         self.folder = folder / "site"
         self.address = Address("127.0.0.1", free_port(), True)
-        self.authority = make_site(self.folder, FLEET, [UNIT, "tractor-8"], ["127.0.0.1", "localhost"], self.address.port)
+        self.authority = make_site(self.folder, FLEET, [UNIT, "tractor-8", "tractor.9"], ["127.0.0.1", "localhost"],
+                                   self.address.port, free_port())
         self.authority.revoke(self.authority.issue(self.folder, "stolen"))
         self.authority.issue(self.folder, "expired", valid=timedelta(hours=-1))
         self.authority.write_public(self.folder)
-        configuration = self.folder / "mosquitto.conf"
-        if folder.stat().st_uid == 0:  # root's temporary folders are closed to mosquitto's own user
+        configuration = self.folder / f"{kind}.conf"
+        if kind == "mosquitto" and folder.stat().st_uid == 0:  # root's temporary folders are closed to mosquitto's own user
             configuration.write_text("user root\n" + configuration.read_text())
         self.log = self.folder / "log"
         with open(self.log, "wb") as log:
-            self.process = subprocess.Popen([mosquitto(), "-c", str(configuration)], stdout=log, stderr=log)
+            program = mosquitto() if kind == "mosquitto" else NATS_SERVER
+            self.process = subprocess.Popen([program, "-c", str(configuration)], stdout=log, stderr=log)
         eventually(lambda: listens(self.address.port) or self.process.poll() is not None)
         assert self.process.poll() is None, self.log.read_text()
 
@@ -45,8 +48,8 @@ class Site:
         return Tls(str(self.folder / "ca.pem"), str(self.folder / f"{name}.pem"), str(self.folder / f"{name}-key.pem"))
 
     def connect(self, name: str, *topics: str, tls: Tls | None = None, address: Address | None = None) -> MqttConnection:
-        connection = MqttConnection(address or self.address, f"test-{name}", subscribe=[(topic, 1) for topic in topics],
-                                    tls=tls or self.tls(name))
+        connection = MqttConnection(address or self.address, f"test-{name.replace('.', '-')}", tls=tls or self.tls(name),
+                                    subscribe=[(topic, 1) for topic in topics])
         while not connection.ready and not connection.lost:
             connection.wait(0.1)
         return connection
@@ -54,7 +57,8 @@ class Site:
     def why_not(self, name: str, tls: Tls | None = None) -> str:
         """What keeps a certificate out; "" when nothing does."""
         try:
-            connection = self.connect(name, "x", tls=tls)
+            topic = f"ucs/v1/{FLEET}/+/alarm" if name == "level2" else wire.topic(FLEET, name, "ack")
+            connection = self.connect(name, topic, tls=tls)
         except MqttError as error:
             return str(error)
         connection.abandon()
@@ -65,15 +69,16 @@ class Site:
         self.process.wait()
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    site = Site(tmp_path_factory.mktemp("mosquitto"))
+@pytest.fixture(scope="module", params=SITES)
+def site(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[Site]:
+    site = Site(tmp_path_factory.mktemp(request.param), request.param)
     yield site
     site.close()
 
 
 def test_certificates_of_the_site_come_in(site: Site) -> None:
     assert site.why_not(UNIT) == ""
+    assert site.why_not("tractor.9") == ""
     assert site.why_not("level2") == ""
 
 
@@ -115,12 +120,12 @@ def test_a_broker_without_tls_is_told(site: Site, tmp_path: Path) -> None:
 def test_a_unit_writes_and_reads_only_what_is_its_own(site: Site) -> None:
     listener = site.connect("level2", f"ucs/v1/{FLEET}/+/alarm")
     for writer in (UNIT, "tractor-8"):
-        connection = site.connect(writer, wire.topic(FLEET, UNIT, "command"))
+        connection = site.connect(writer, wire.topic(FLEET, writer, "command"))
         connection.publish(wire.topic(FLEET, UNIT, "alarm"), writer.encode(), 1)
         connection.close()
-    eavesdropper = site.connect("tractor-8", wire.topic(FLEET, UNIT, "command"))
+    eavesdropper = site.connect("tractor-8", wire.topic(FLEET, UNIT, "command"))  # mosquitto ignores it, NATS refuses it
     listener.publish(wire.topic(FLEET, UNIT, "command"), b"secret", 1)
-    last = site.connect(UNIT, "x")
+    last = site.connect(UNIT, wire.topic(FLEET, UNIT, "ack"))
     last.publish(wire.topic(FLEET, UNIT, "alarm"), b"last", 1)
     received: list[bytes] = []
     while b"last" not in received:
@@ -136,7 +141,7 @@ def test_a_unit_writes_and_reads_only_what_is_its_own(site: Site) -> None:
 def test_the_whole_way_works_over_mutual_tls(site: Site, tmp_path: Path) -> None:
     unit = Unit(tmp_path, site.address)
     unit.write(*range(1, 51))
-    level2 = site.connect("level2", f"ucs/v1/{FLEET}/{UNIT}/alarm")
+    level2 = site.connect("level2", f"ucs/v1/{FLEET}/+/alarm")
     seqs: set[int] = set()
     with BridgeThread(msgspec.structs.replace(unit.settings, tls=site.tls(UNIT)), unit.said.append):
         while len(seqs) < 50:
@@ -145,13 +150,18 @@ def test_the_whole_way_works_over_mutual_tls(site: Site, tmp_path: Path) -> None
             ack = wire.Ack(unit=UNIT, boot=1, seq=0, also=tuple((seq, seq) for seq in sorted(seqs)[-60:]), t=seconds(1))
             level2.publish(wire.topic(FLEET, UNIT, "ack"), wire.encode(ack), 1)
         eventually(lambda: delivered_upto(delivered_path(unit.path)) == {1: 50})
+        states = site.connect("level2", f"ucs/v1/{FLEET}/+/connection")
+        while not (retained := states.take()):
+            states.wait(0.1)
+        assert retained[0].retained and wire.decode(retained[0].payload, wire.Connection).state == "ONLINE"
+        states.abandon()
     level2.close()
     unit.journal.close()
 
 
 def test_private_keys_are_for_their_owner_alone(site: Site) -> None:
     keys = list(site.folder.glob("*-key.pem"))
-    assert len(keys) == 7
+    assert len(keys) == 8
     assert all(stat.S_IMODE(key.stat().st_mode) == 0o600 for key in keys)
 
 

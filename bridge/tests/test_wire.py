@@ -103,7 +103,7 @@ def test_topics_are_built_and_taken_apart(kind: str, message: str, text: str) ->
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "a+b", "#", "$SYS", "two words", "a\0b", "x" * 65, "tab\t", "ü" * 40, "esc\x1b[2J",
-                                  "csi\x9b2J", "line\n"])
+                                  "csi\x9b2J", "line\n", "*", ">"])
 def test_names_that_cannot_stand_in_a_topic_are_refused(name: str) -> None:
     with pytest.raises(wire.WireError, match="can't stand in an MQTT topic"):
         wire.topic("farm", name, "alarm")

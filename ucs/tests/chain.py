@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import signal
-import socket
 import sqlite3
 import subprocess
 import sys
@@ -11,6 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from bridge.tests.brokers import NATS, free_port
 from level1.event import Event, seconds
 
 ROOT = Path(__file__).parents[2]
@@ -57,17 +57,15 @@ CONFIG = """
 
 
 class Chain:
-    """The four processes of a site, each of which can be killed and started again."""
+    """The four processes of a site, each of which can be killed and started again. nats: a program to be the broker."""
 
-    def __init__(self, folder: Path, pause_s: float = 0.02):
+    def __init__(self, folder: Path, pause_s: float = 0.02, nats: str = ""):
         self.folder = folder
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
+        port = free_port()
         (folder / "unit.toml").write_text(textwrap.dedent(CONFIG.format(port=port)))
         python, ucs = [sys.executable, "-c"], [sys.executable, "-m", "ucs"]
         self.commands = {
-            "broker": [*python, textwrap.dedent(BROKER), str(port)],
+            "broker": self._nats(nats, port) if nats else [*python, textwrap.dedent(BROKER), str(port)],
             "level2": [*ucs, "level2", "--broker", f"mqtt://127.0.0.1:{port}", "--store", str(folder / "level2.db")],
             "bridge": [*ucs, "bridge", str(folder / "unit.toml")],
             "unit": [*python, textwrap.dedent(UNIT), str(folder / "journal.db"), str(pause_s)],
@@ -75,6 +73,12 @@ class Chain:
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         for name in self.commands:
             self.start(name)
+
+    def _nats(self, program: str, port: int) -> list[str]:
+        """NATS instead of the embedded broker, with its store in the folder: a killed one comes back to what it had."""
+        file = self.folder / "nats.conf"
+        file.write_text(NATS.format(other=free_port(), folder=self.folder, port=port))
+        return [program, "-c", str(file)]
 
     def start(self, name: str) -> None:
         with open(self.folder / f"{name}.log", "ab") as log:
