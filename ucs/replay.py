@@ -38,9 +38,9 @@ def add_parser(commands: Any) -> None:
     """The arguments of `ucs replay`."""
     parser: ArgumentParser = commands.add_parser(
         "replay", help="run alarm definitions over recordings",
-        description="Run alarm definitions over recordings (candump, ASC, BLF, TRC, csv, MF4, pcap, NMEA 0183 text, also with .gz) "
-                    "as fast as it can, in the time of the recording. Every repair counts as armed unless --unit-toml says otherwise; its "
-                    "frames are only reported.",
+        description="Run alarm definitions over recordings (candump, ASC, BLF, TRC, csv, MF4, pcap, NMEA 0183 text, also with "
+                    ".gz) as fast as it can, in the time of the recording. Every repair counts as armed unless --unit-toml says "
+                    "otherwise; its frames are only reported.",
         epilog="Example: ucs replay drive.log --dbc isobus_tractor.dbc --events drive.jsonl")
     parser.add_argument("log", nargs="+", metavar="LOG", help="recordings, folders of them, patterns; each is a run of its own")
     parser.add_argument("--dbc", nargs="+", default=[], metavar="FILE", help="definitions; shipped ones go by name alone")
