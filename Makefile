@@ -20,8 +20,10 @@ help:
 demo: $(VENV)/ready
 	$(BIN)/ucs demo
 
+# In two goes, as only one program at a time may use the virtual CAN buses; `pytest` alone does the same in one.
 test: packages-vcan check
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not vcan"
+	$(BIN)/python -m pytest -m vcan
 
 check: $(VENV)/ready
 	$(BIN)/ruff check
@@ -39,7 +41,7 @@ test-wheel: $(VENV)/ready
 	    if [ -d $$package/tests ]; then cp -r $$package/tests $$site/$$package/; fi; \
 	done && \
 	cp pyproject.toml README.md $$site/ && cd $$site && \
-	$(CURDIR)/$(WHEEL_VENV)/bin/python -m pytest -q -m "not vcan" -p no:cacheprovider \
+	$(CURDIR)/$(WHEEL_VENV)/bin/python -m pytest -q -n auto --dist loadfile -m "not vcan" -p no:cacheprovider \
 	    $$(for package in $(PACKAGES); do if [ -d $$package/tests ]; then echo $$package/tests; fi; done)
 
 # Writes its counts into docs/reliability.md.

@@ -2,10 +2,10 @@
 
 Theory of operation. The other tests run here, natively. Then the same pytest command runs once more under
 `hil_tests/vcan_run.py`, restricted to the `vcan` tests selected here; it hands each report over as it comes and they are
-taken in as if the tests had run here (in two guests beside each other, as these tests mostly wait): one summary, one exit
-status, and `-x`, `-k`, `--lf`, `--junitxml` do what they always do. A `vcan` test for which no report came (the guest died,
+taken in as if the tests had run here (a guest for each file, some beside each other, as these tests mostly wait): one summary,
+one exit status, and `-x`, `-k`, `--lf`, `--junitxml` do what they always do. A `vcan` test for which no report came (the guest died,
 ran out of time, could not collect it) is an error. Without a way to a vcan the run ends at once with exit status 125 and
-the packages to install; nothing is skipped.
+the packages to install; nothing is skipped. The workers of pytest-xdist share no bus: with `-n`, `vcan` tests are refused.
 """
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def pytest_runtestloop(session: pytest.Session) -> Generator[None, object, objec
     """Run the tests that need no vcan here, then the others in the guest."""
     everything = list(session.items)
     elsewhere = [item for item in everything if needs_vcan(item)]
-    if not elsewhere or session.config.option.collectonly or vcan_run.present():
+    if not elsewhere or session.config.option.collectonly or vcan_run.present() or is_worker(session.config):
         return (yield)
     if obstacle := vcan_run.obstacle():
         pytest.exit(f"{len(elsewhere)} tests need vcan0: {obstacle}", returncode=vcan_run.NO_WAY)
@@ -76,18 +76,35 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
             "vcan tests: " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count))
 
 
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Two tests at a time on one bus would hear each other."""
+    if needs_vcan(item) and is_worker(item.config):
+        pytest.fail('tests marked "vcan" share the buses: run them without -n, or leave them out with -m "not vcan"', pytrace=False)
+
+
+def is_worker(config: pytest.Config) -> bool:
+    """Whether this is one of several processes that pytest-xdist has started."""
+    return hasattr(config, "workerinput")
+
+
 def needs_vcan(item: pytest.Item) -> bool:
     """Whether the test is marked `vcan`."""
     return item.get_closest_marker("vcan") is not None
 
 
 def run_guests(session: pytest.Session, items: list[pytest.Item]) -> None:
-    """Run the `vcan` tests in `GUESTS` guests, each the tests of some files; what they report is taken in guest by guest."""
-    files = list(dict.fromkeys(item.path for item in items))
-    shares = [[item for item in items if files.index(item.path) % GUESTS == number] for number in range(GUESTS)]
+    """Run the `vcan` tests, those of a file in a guest of their own, `GUESTS` guests at a time."""
+    waiting: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        waiting.setdefault(item.path, []).append(item)
+    shares = sorted(waiting.values(), key=len, reverse=True)
     with contextlib.ExitStack() as stack:
-        for guest in [stack.enter_context(Guest(session, share)) for share in shares if share]:
-            guest.run()
+        guests: list[Guest] = []
+        while shares or guests:
+            while shares and len(guests) < GUESTS:
+                guests.append(stack.enter_context(Guest(session, shares.pop(0))))
+            guests = [guest for guest in guests if not guest.take()]
+            time.sleep(0.05)
 
 
 class Guest:
@@ -97,8 +114,10 @@ class Guest:
         self.session, self.config, self.items = session, session.config, items
         self.waiting = {item.nodeid: item for item in items}
         self.output: list[str] = []
+        self.begun = ""
         self.job = tempfile.TemporaryDirectory(prefix="vcan-tests-")
         self.runner = self._start(Path(self.job.name))
+        self.out = (Path(self.job.name) / "out").open(encoding="utf-8", errors="backslashreplace")
 
     def __enter__(self) -> Guest:
         return self
@@ -106,18 +125,21 @@ class Guest:
     def __exit__(self, *_: object) -> None:
         self.runner.terminate()
         self.runner.wait()
+        self.out.close()
         self.job.cleanup()
 
-    def run(self) -> None:
-        """Take their reports in as they come. Raises what ends a session early (`-x`, Ctrl-C)."""
+    def take(self) -> bool:
+        """Take in the reports that have come; gives whether that was all. Raises what ends a session early (`-x`, Ctrl-C)."""
+        ended = self.runner.poll() is not None
         for line in self._lines():
             if line.startswith(MARK):
-                self._take(json.loads(line.strip(MARK + "\r\n")))
+                self._report(json.loads(line.strip(MARK + "\r\n")))
             else:
                 self._keep(line)
-        if not self.session.shouldfail and not self.session.shouldstop:
+        if ended and not self.session.shouldfail and not self.session.shouldstop:
             self._blame()
         self._stop_if_asked()
+        return ended
 
     def _start(self, job: Path) -> subprocess.Popen[bytes]:
         """The guest; what its pytest writes goes into the file `out`, so that it never waits for a reader."""
@@ -125,29 +147,23 @@ class Guest:
         selected.write_text("\n".join(self.waiting))
         parameters = self.config.invocation_params
         command = [sys.executable, vcan_run.__file__, "-t", str(TIMEOUT_S), sys.executable, "-m", "pytest",
-                   *map(str, parameters.args), "-o", f"cache_dir={job / 'cache'}"]
+                   *map(str, parameters.args)]
+        if self.config.pluginmanager.hasplugin("cacheprovider"):
+            command += ["-o", f"cache_dir={job / 'cache'}"]
         with (job / "out").open("wb") as out:
             return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT,
                                     cwd=parameters.dir, env={**os.environ, SELECTED: str(selected)})
 
     def _lines(self) -> Iterator[str]:
-        """The lines that the guest's pytest writes, until it ends."""
-        with (Path(self.job.name) / "out").open(encoding="utf-8", errors="backslashreplace") as out:
-            line = ""
-            while True:
-                ended = self.runner.poll() is not None
-                line += out.readline()
-                if line.endswith("\n"):
-                    yield line
-                    line = ""
-                elif ended:
-                    if line:
-                        yield line
-                    return
-                else:
-                    time.sleep(0.05)
+        """The lines that the guest's pytest has written since the last call; one that it is still writing comes next time."""
+        while line := self.out.readline():
+            if not line.endswith("\n"):
+                self.begun += line
+                return
+            yield self.begun + line
+            self.begun = ""
 
-    def _take(self, message: dict[str, Any]) -> None:
+    def _report(self, message: dict[str, Any]) -> None:
         """One message of the guest: a test started, a report, a test finished."""
         hook = self.config.hook
         item = self.waiting.get(message["nodeid"])
