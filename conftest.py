@@ -3,9 +3,9 @@
 Theory of operation. The other tests run here, natively. Then the same pytest command runs once more under
 `hil_tests/vcan_run.py`, restricted to the `vcan` tests selected here; it hands each report over as it comes and they are
 taken in as if the tests had run here (a guest for each file, some beside each other, as these tests mostly wait): one summary,
-one exit status, and `-x`, `-k`, `--lf`, `--junitxml` do what they always do. A `vcan` test for which no report came (the guest died,
-ran out of time, could not collect it) is an error. Without a way to a vcan the run ends at once with exit status 125 and
-the packages to install; nothing is skipped. The workers of pytest-xdist share no bus: with `-n`, `vcan` tests are refused.
+one exit status, and `-x`, `-k`, `--lf`, `--junitxml` do what they always do. A `vcan` test for which no report came (the guest
+died, ran out of time, could not collect it) is an error. Without a way to a vcan the run ends at once with exit status 125 and
+the packages to install; nothing is skipped. The workers of pytest-xdist would share the buses: with `-n`, `vcan` tests fail.
 """
 from __future__ import annotations
 
