@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from benchmarks import nats, powercut
+from benchmarks import faults, nats, powercut
 from benchmarks.chain import peak_kb
 from bridge import wire
 from bridge.gate import Gate, Passed, Refused
@@ -239,9 +239,14 @@ def main() -> int:
         print(f"{trial.__name__.replace('_', ' ')}", flush=True)
         rows.append(trial(max(2, count // share), dice))
         print(f"\r{'good' if rows[-1].good else 'BAD'}: {rows[-1].fault}: {rows[-1].often}: {rows[-1].outcome}\x1b[K", flush=True)
-    if args.write:
+    found, told = faults.gather(run=True)
+    cases, passed = sum(fault.cases for fault in found), sum(fault.passed for fault in found)
+    good = cases == passed > 0
+    print(f"{'good' if good else 'BAD'}: {len(found)} faults in {cases} tests: {passed} passed")
+    if args.write and good:
         put_into_page(rows)
-    return 0 if all(row.good for row in rows) else 1
+        faults.put_into_page(found)
+    return 0 if good and all(row.good for row in rows) else 1
 
 
 if __name__ == "__main__":

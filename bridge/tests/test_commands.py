@@ -104,6 +104,7 @@ def test_a_stranger_is_refused_and_supervision_told(site: Site) -> None:
     assert site.obeyed == []
 
 
+@pytest.mark.fault("a flood of strangers' commands", "counted, a few a second answered; the next good one is obeyed")
 def test_a_flood_of_strangers_is_counted_but_hardly_answered(site: Site) -> None:
     stranger = Ed25519PrivateKey.generate()
     begin = time.monotonic()
@@ -122,6 +123,7 @@ def test_a_flood_of_strangers_is_counted_but_hardly_answered(site: Site) -> None
     eventually(lambda: site.link.receive() or sum(refusal.count for refusal in site.link.refusals) == 300)
 
 
+@pytest.mark.fault("a retained command", "refused")
 def test_a_retained_command_is_refused(site: Site) -> None:
     site.thread.__exit__()
     now = seconds(time.monotonic_ns())
@@ -133,6 +135,7 @@ def test_a_retained_command_is_refused(site: Site) -> None:
     assert site.obeyed == []
 
 
+@pytest.mark.fault("supervision not running when a command comes", "refused, and said")
 def test_a_command_without_supervision_is_refused(site: Site) -> None:
     site.link.close()
     site.send()
@@ -156,6 +159,7 @@ def test_a_longer_period_thins_the_monitoring_out(site: Site) -> None:
     assert len(site.peer.messages(wire.MonitorMessage)) <= 1
 
 
+@pytest.mark.fault("a key taken out of the file while running", "commands no more, at once")
 def test_whoever_is_taken_out_of_the_key_file_commands_no_more(site: Site) -> None:
     site.send(1)
     assert site.results(1)[-1][2] == "done"
@@ -164,6 +168,7 @@ def test_whoever_is_taken_out_of_the_key_file_commands_no_more(site: Site) -> No
     assert site.results(2)[-1] == ("", 0, "refused", "unknown key")
 
 
+@pytest.mark.fault("a command that comes again")
 def test_a_restarted_bridge_obeys_nothing_again(site: Site) -> None:
     payload = site.send(5)
     assert site.results(1)[-1][2] == "done"

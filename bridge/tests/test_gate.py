@@ -71,12 +71,14 @@ def test_a_good_command_becomes_an_order(gate: Gate) -> None:
 # Who
 
 
+@pytest.mark.fault("a command by a stranger, forged or changed on the way", "refused: unknown key, wrong signature")
 def test_a_stranger_is_refused(gate: Gate) -> None:
     stranger = Ed25519PrivateKey.generate()
     assert reason(decide(gate, wire.encode(signed(an_order(), FLEET, "nobody", stranger)))) == "unknown key"
     assert reason(decide(gate, wire.encode(signed(an_order(), FLEET, "reset", stranger)))) == "wrong signature"
 
 
+@pytest.mark.fault("a command by a stranger, forged or changed on the way")
 def test_every_changed_byte_of_the_order_breaks_the_signature(gate: Gate) -> None:
     command = signed(an_order(), FLEET, "reset", PRIVATE["reset"])
     for at in range(0, len(command.body), 3):
@@ -84,12 +86,14 @@ def test_every_changed_byte_of_the_order_breaks_the_signature(gate: Gate) -> Non
         assert reason(decide(gate, wire.encode(msgspec.structs.replace(command, body=changed)))) == "wrong signature"
 
 
+@pytest.mark.fault("a command by a stranger, forged or changed on the way")
 @pytest.mark.parametrize("signature", ["", "AAAA", "no base64!", "A" * 88, "ü" * 10])
 def test_a_malformed_signature_is_refused(gate: Gate, signature: str) -> None:
     command = msgspec.structs.replace(signed(an_order(), FLEET, "reset", PRIVATE["reset"]), signature=signature)
     assert reason(decide(gate, wire.encode(command))) == "wrong signature"
 
 
+@pytest.mark.fault("a command beyond the role", "refused with the role")
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("name", [*RIGHTS, "nozzle_pressure"])
 def test_each_role_may_do_what_it_may_and_no_more(gate: Gate, role: str, name: str) -> None:
@@ -100,6 +104,7 @@ def test_each_role_may_do_what_it_may_and_no_more(gate: Gate, role: str, name: s
         assert reason(decision) == f'the role "{role}" may not {name}'
 
 
+@pytest.mark.fault("a command by a stranger, forged or changed on the way")
 def test_a_key_taken_away_may_nothing(gate: Gate) -> None:
     gate.keys = {name: key for name, key in KEYS.items() if name != "reset"}
     assert reason(decide(gate, sealed(an_order()))) == "unknown key"
@@ -108,6 +113,7 @@ def test_a_key_taken_away_may_nothing(gate: Gate) -> None:
 # For whom
 
 
+@pytest.mark.fault("a command for another unit, fleet or boot", "refused")
 @pytest.mark.parametrize(("fleet", "changes", "told"), [
     ("other-farm", {}, "wrong signature"),
     (FLEET, {"unit": "tractor-8"}, "wrong signature"),
@@ -117,6 +123,7 @@ def test_a_command_for_another_is_refused(gate: Gate, fleet: str, changes: dict[
     assert reason(decide(gate, sealed(an_order(**changes), fleet=fleet))) == told
 
 
+@pytest.mark.fault("a command for another unit, fleet or boot")
 def test_an_order_for_another_unit_under_this_units_topic_is_refused(gate: Gate) -> None:
     order = an_order(unit="tractor-8")
     body = wire.encode(order).decode()
@@ -128,6 +135,7 @@ def test_an_order_for_another_unit_under_this_units_topic_is_refused(gate: Gate)
 # When
 
 
+@pytest.mark.fault("a command too late, too early or valid for too long", "refused with the reason, to the nanosecond")
 @pytest.mark.parametrize(("t_s", "expires_s", "told"), [
     (-20, -1, "expired"), (-29, 2, "valid for longer than 30 s"), (3, 10, "from the future"), (0, 0, "valid for longer than 30 s"),
     (0, -5, "valid for longer than 30 s"), (0, 10**9, "valid for longer than 30 s"), (-6000, -5990, "valid for longer than 30 s")])
@@ -136,6 +144,7 @@ def test_a_command_at_the_wrong_time_is_refused(gate: Gate, t_s: int, expires_s:
     assert reason(decide(gate, sealed(order))) == told
 
 
+@pytest.mark.fault("a command too late, too early or valid for too long")
 def test_a_command_is_valid_to_its_last_nanosecond(gate: Gate) -> None:
     order = an_order(t=seconds(NOW), expires_t=seconds(NOW + VALID_NS))
     assert isinstance(decide(gate, sealed(order), NOW + VALID_NS), Passed)
@@ -152,6 +161,7 @@ def test_monstrous_numbers_are_refused(gate: Gate, number: str, field: str) -> N
 # Once
 
 
+@pytest.mark.fault("a command that comes again", "the same answer, obeyed once; an older counter is refused, also after a restart")
 def test_a_command_that_comes_again_gets_the_same_answer_and_no_second_obedience(gate: Gate) -> None:
     passed = decide(gate, sealed(an_order()))
     assert isinstance(passed, Passed)
@@ -160,6 +170,7 @@ def test_a_command_that_comes_again_gets_the_same_answer_and_no_second_obedience
     assert decide(gate, sealed(an_order()), NOW + 3600 * S) == Repeated("c-1", 1, "done", "")
 
 
+@pytest.mark.fault("a command that comes again")
 def test_a_counter_never_goes_back(gate: Gate) -> None:
     assert isinstance(decide(gate, sealed(an_order(5))), Passed)
     assert reason(decide(gate, sealed(an_order(4)))) == "its counter was used before"
@@ -167,6 +178,7 @@ def test_a_counter_never_goes_back(gate: Gate) -> None:
     assert isinstance(decide(gate, sealed(an_order(6))), Passed)
 
 
+@pytest.mark.fault("a command that comes again")
 def test_each_key_has_its_own_counter_whatever_it_is_called(gate: Gate) -> None:
     assert isinstance(decide(gate, sealed(an_order(5))), Passed)
     assert isinstance(decide(gate, sealed(an_order(1), "pause")), Passed)
@@ -175,6 +187,7 @@ def test_each_key_has_its_own_counter_whatever_it_is_called(gate: Gate) -> None:
     assert reason(decide(gate, wire.encode(command))) == "its counter was used before"
 
 
+@pytest.mark.fault("a command that comes again")
 def test_a_counter_is_on_the_disk_before_its_order_is_given_out(gate: Gate, path: Path) -> None:
     decide(gate, sealed(an_order(5)))
     again = Gate(path, FLEET, UNIT, KEYS, NOW)
@@ -183,6 +196,7 @@ def test_a_counter_is_on_the_disk_before_its_order_is_given_out(gate: Gate, path
     again.close()
 
 
+@pytest.mark.fault("counters lost, damaged, or not to be written")
 def test_no_disk_no_obedience(gate: Gate, path: Path) -> None:
     other = sqlite3.connect(path, isolation_level=None)
     gate._connection.execute("PRAGMA busy_timeout = 0")
@@ -193,6 +207,7 @@ def test_no_disk_no_obedience(gate: Gate, path: Path) -> None:
     assert isinstance(decide(gate, sealed(an_order())), Passed)
 
 
+@pytest.mark.fault("a command that comes again")
 def test_old_answers_are_forgotten_but_not_the_counter(gate: Gate, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bridge.gate.ANSWERS", 20)
     for seq in range(1, 23):
@@ -201,6 +216,8 @@ def test_old_answers_are_forgotten_but_not_the_counter(gate: Gate, monkeypatch: 
     assert isinstance(decide(gate, sealed(an_order(3))), Repeated)
 
 
+@pytest.mark.fault("counters lost, damaged, or not to be written",
+                   "what was issued before is refused; without a disk everything is")
 @pytest.mark.parametrize("damage", [b"not a database" * 100, b"SQLite format 3\0" + bytes(100)])
 def test_lost_counters_let_nothing_old_in(path: Path, damage: bytes) -> None:
     path.write_bytes(damage)
@@ -212,6 +229,7 @@ def test_lost_counters_let_nothing_old_in(path: Path, damage: bytes) -> None:
     gate.close()
 
 
+@pytest.mark.fault("counters lost, damaged, or not to be written")
 def test_counters_taken_away_let_nothing_old_in_either(gate: Gate, path: Path) -> None:
     captured = sealed(an_order(5))
     assert isinstance(decide(gate, captured), Passed)
@@ -239,6 +257,7 @@ def test_a_folder_that_cannot_be_written_is_told() -> None:
 # Everything at once
 
 
+@pytest.mark.fault("a command by a stranger, forged or changed on the way")
 def test_forged_replayed_expired_and_malformed_commands_are_never_obeyed(gate: Gate) -> None:
     dice = random.Random(1)
     good = [sealed(an_order(seq)) for seq in (1, 2, 3)]

@@ -70,6 +70,7 @@ def test_a_new_event_is_sent_at_once_and_only_once(unit: Unit) -> None:
     assert unit.outbox.due(S) == []
 
 
+@pytest.mark.fault("level 2 away for long", "events are sent ever less often; when it is back, within 2 s")
 def test_an_event_is_sent_again_later_and_later_until_it_is_acknowledged(unit: Unit) -> None:
     unit.outbox.connected(0)
     unit.write(1)
@@ -90,6 +91,7 @@ def test_an_event_is_sent_again_later_and_later_until_it_is_acknowledged(unit: U
     assert unit.outbox.next_due_ns() is None
 
 
+@pytest.mark.fault("level 2 away for long")
 def test_a_level_2_that_is_back_need_not_wait_for_the_longest_pause(unit: Unit) -> None:
     unit.outbox.connected(0)
     unit.write(1, 2)
@@ -125,6 +127,7 @@ def test_what_waited_for_the_connection_is_historical_and_what_is_new_goes_first
     assert seqs(first[1:]) == [1]
 
 
+@pytest.mark.fault("poor link")
 def test_the_backlog_leaves_at_a_bounded_rate_and_completely(unit: Unit) -> None:
     unit.write(*range(1, 501))
     unit.outbox.connected(0)
@@ -140,6 +143,7 @@ def test_the_backlog_leaves_at_a_bounded_rate_and_completely(unit: Unit) -> None
     assert now == pytest.approx(500 / BACKLOG_PER_S * S, rel=0.05)
 
 
+@pytest.mark.fault("poor link", "the newest events first, the backlog behind at a bounded rate")
 def test_many_new_events_on_a_poor_link_become_backlog_and_the_newest_goes_first(unit: Unit) -> None:
     unit.outbox.connected(0)
     unit.write(*range(1, FRESH + 2 * WINDOW))
@@ -163,6 +167,7 @@ def test_a_lost_seq_is_told_by_its_neighbour(unit: Unit) -> None:
     assert unit.outbox.due(0)[-1].prev == 2
 
 
+@pytest.mark.fault("bridge killed", "what was not acknowledged is sent again, nothing else")
 def test_a_killed_bridge_sends_again_what_was_not_acknowledged_and_nothing_else(unit: Unit) -> None:
     unit.outbox.connected(0)
     unit.write(*range(1, 21))
@@ -186,6 +191,7 @@ def test_a_new_connection_sends_again_what_the_old_one_carried(unit: Unit) -> No
 # Acknowledgements
 
 
+@pytest.mark.fault("level 2 acknowledges what it never got, or goes backwards")
 def test_an_acknowledgement_of_what_was_never_sent_changes_nothing(unit: Unit) -> None:
     unit.write(1, 2, 3)
     assert unit.outbox.acknowledge(1, 3) is Verdict.NOTHING_NEW
@@ -196,6 +202,7 @@ def test_an_acknowledgement_of_what_was_never_sent_changes_nothing(unit: Unit) -
     assert seqs(unit.outbox.due(S)) == [1, 2, 3]
 
 
+@pytest.mark.fault("level 2 acknowledges what it never got, or goes backwards")
 def test_an_acknowledgement_that_goes_backwards_changes_nothing(unit: Unit) -> None:
     unit.outbox.connected(0)
     unit.write(*range(1, 11))
@@ -211,6 +218,7 @@ def test_an_empty_acknowledgement_is_harmless(unit: Unit) -> None:
     assert unit.outbox.acknowledge(1, 0, [(5, 2)]) is Verdict.NOTHING_NEW
 
 
+@pytest.mark.fault("level 2 loses its disk", "it asks for the gap, the unit sends again what it still has")
 def test_acknowledged_events_are_sent_again_when_level_2_lost_them(unit: Unit) -> None:
     unit.outbox.connected(0)
     unit.write(*range(1, 11))
@@ -259,6 +267,7 @@ def test_waiting_counts_what_is_not_acknowledged(unit: Unit) -> None:
 # The file of what was delivered
 
 
+@pytest.mark.fault("the bridge's file of deliveries damaged", "events are sent twice, none is lost")
 @pytest.mark.parametrize("content", [b"not a database", b"SQLite format 3\0" + bytes(200)])
 def test_a_damaged_file_of_deliveries_costs_a_second_delivery_only(unit: Unit, content: bytes) -> None:
     unit.outbox.connected(0)

@@ -98,6 +98,7 @@ def test_the_journal_of_another_unit_is_not_sent(tmp_path: Path, broker: Broker)
     assert 'belongs to the unit "tractor-8"' in said[0]
 
 
+@pytest.mark.fault("the journal takes nothing", "events leave beside it")
 def test_what_the_journal_cannot_take_arrives_too(unit: Unit, peer: Peer) -> None:
     link = RunLink(unit.path)
     with start(unit) as bridge:
@@ -125,6 +126,7 @@ def test_a_second_bridge_on_a_journal_is_refused(unit: Unit) -> None:
 # Acknowledgements
 
 
+@pytest.mark.fault("malformed, huge, retained or foreign acknowledgements", "refused, counted, told once")
 @pytest.mark.parametrize("payload", [b"", b"null", b"{" * 100, b"\xff" * 10, b'{"unit":"tractor-7","boot":1,"seq":"1","t":0}',
                                      b'{"schema":9,"unit":"tractor-7"}', b" " * 100_000])
 def test_a_malformed_acknowledgement_is_counted_and_told_once(unit: Unit, peer: Peer, payload: bytes) -> None:
@@ -138,6 +140,7 @@ def test_a_malformed_acknowledgement_is_counted_and_told_once(unit: Unit, peer: 
     assert len([line for line in unit.said if "refused" in line]) == 1
 
 
+@pytest.mark.fault("level 2 acknowledges what it never got, or goes backwards", "nothing is taken out of the outbox; told once")
 def test_an_acknowledgement_of_what_was_never_sent_is_refused(unit: Unit, peer: Peer) -> None:
     unit.write(1, 2)
     with start(unit) as bridge:
@@ -151,6 +154,7 @@ def test_an_acknowledgement_of_what_was_never_sent_is_refused(unit: Unit, peer: 
         eventually(lambda: delivered_upto(delivered_path(unit.path)) == {1: 2})
 
 
+@pytest.mark.fault("malformed, huge, retained or foreign acknowledgements")
 def test_a_retained_acknowledgement_is_refused(unit: Unit, peer: Peer) -> None:
     unit.write(1)
     ack = wire.encode(wire.Ack(unit=UNIT, boot=1, seq=1, t=seconds(1)))
@@ -161,6 +165,7 @@ def test_a_retained_acknowledgement_is_refused(unit: Unit, peer: Peer) -> None:
     assert any("retained: it may be of any age" in line for line in unit.said)
 
 
+@pytest.mark.fault("a packet of 10 MB", "ends that connection before it is read; the next one goes on")
 def test_a_packet_of_10_mb_ends_a_connection_and_nothing_else(unit: Unit, peer: Peer, broker: Broker) -> None:
     unit.write(1)
     with start(unit) as bridge:
@@ -191,6 +196,7 @@ def test_the_connection_is_announced_kept_and_taken_back(unit: Unit, peer: Peer,
     peer.until(lambda: states(peer) == ["ONLINE", "OFFLINE"])
 
 
+@pytest.mark.fault("bridge vanishes", "the broker says CONNECTION_BROKEN")
 def test_a_bridge_that_vanishes_is_told_by_the_broker(peer: Peer, broker: Broker) -> None:
     will = (wire.topic(FLEET, UNIT, "connection"), b'{"unit":"tractor-7","boot":1,"seq":1,"t":0,"state":"CONNECTION_BROKEN",'
                                                    b'"supervising":false,"waiting":0}')
@@ -201,6 +207,7 @@ def test_a_bridge_that_vanishes_is_told_by_the_broker(peer: Peer, broker: Broker
     peer.until(lambda: states(peer) == ["CONNECTION_BROKEN"])
 
 
+@pytest.mark.fault("supervision ends while the bridge runs", "level 2 is told within 2 s")
 def test_level_2_is_told_whether_supervision_runs(unit: Unit, peer: Peer) -> None:
     link = RunLink(unit.path)
     with start(unit):
@@ -236,6 +243,8 @@ def test_only_the_latest_sample_is_sent_and_at_the_period(unit: Unit, peer: Peer
 # Brokers that are not there
 
 
+@pytest.mark.fault("no broker, or gone after its acknowledgement",
+                   "told once; kept in the journal, sent again on the next connection")
 def test_an_unreachable_broker_is_told_once_and_tried_on(tmp_path: Path, kind: str) -> None:
     port = brokers.free_port()
     unit = Unit(tmp_path, Address("127.0.0.1", port, False))
@@ -251,6 +260,7 @@ def test_an_unreachable_broker_is_told_once_and_tried_on(tmp_path: Path, kind: s
     unit.journal.close()
 
 
+@pytest.mark.fault("no broker, or gone after its acknowledgement")
 def test_a_broker_killed_after_its_acknowledgement_loses_nothing(tmp_path: Path, kind: str) -> None:
     broker = brokers.start(kind)
     unit = Unit(tmp_path, broker.address)

@@ -82,11 +82,13 @@ def test_certificates_of_the_site_come_in(site: Site) -> None:
     assert site.why_not("level2") == ""
 
 
+@pytest.mark.fault("wrong, expired, revoked or no certificate", "no connection")
 @pytest.mark.parametrize("name", ["stolen", "expired"])
 def test_revoked_and_expired_certificates_stay_out(site: Site, name: str) -> None:
     assert site.why_not(name) != ""
 
 
+@pytest.mark.fault("wrong, expired, revoked or no certificate")
 def test_another_authoritys_certificate_stays_out(site: Site, tmp_path: Path) -> None:
     other = Authority("other")
     other.issue(tmp_path, UNIT)
@@ -94,10 +96,12 @@ def test_another_authoritys_certificate_stays_out(site: Site, tmp_path: Path) ->
     assert site.why_not(UNIT, tls) != ""
 
 
+@pytest.mark.fault("wrong, expired, revoked or no certificate")
 def test_nobody_comes_in_without_certificate(site: Site) -> None:
     assert site.why_not("nobody", Tls(ca=str(site.folder / "ca.pem"))) != ""
 
 
+@pytest.mark.fault("a broker of another authority, under another name, or without TLS", "no connection; what to set is said")
 def test_a_broker_of_another_authority_is_refused(site: Site, tmp_path: Path) -> None:
     Authority("other").write_public(tmp_path)
     tls = msgspec.structs.replace(site.tls(UNIT), ca=str(tmp_path / "ca.pem"))
@@ -105,11 +109,13 @@ def test_a_broker_of_another_authority_is_refused(site: Site, tmp_path: Path) ->
     assert "set [bridge] ca to the authority that signed it" in site.why_not(UNIT, tls)
 
 
+@pytest.mark.fault("a broker of another authority, under another name, or without TLS")
 def test_a_broker_under_another_name_is_refused(site: Site) -> None:
     with pytest.raises(MqttError, match="its certificate is refused .*not valid for '127.0.0.2'"):
         site.connect(UNIT, "x", address=site.address._replace(host="127.0.0.2"))
 
 
+@pytest.mark.fault("a broker of another authority, under another name, or without TLS")
 def test_a_broker_without_tls_is_told(site: Site, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as plain:
         threading.Thread(target=lambda: plain.accept()[0].sendall(b"no TLS here"), daemon=True).start()
@@ -117,6 +123,7 @@ def test_a_broker_without_tls_is_told(site: Site, tmp_path: Path) -> None:
             site.connect(UNIT, "x", address=site.address._replace(port=plain.getsockname()[1]))
 
 
+@pytest.mark.fault("a unit that writes to or listens on another's topics", "the broker lets nothing through")
 def test_a_unit_writes_and_reads_only_what_is_its_own(site: Site) -> None:
     listener = site.connect("level2", f"ucs/v1/{FLEET}/+/alarm")
     for writer in (UNIT, "tractor-8"):

@@ -111,6 +111,7 @@ def test_every_opening_gets_a_higher_boot_id(path: Path) -> None:
     assert boots == [1, 2, 3]
 
 
+@pytest.mark.fault("journal, boot file or card lost", "no boot id comes back, so no identity does")
 @pytest.mark.parametrize("victims", [["journal.db"], ["journal.db.boot"], ["journal.db", "journal.db-wal"]])
 def test_a_lost_journal_or_boot_file_brings_no_boot_id_back(path: Path, victims: list[str]) -> None:
     for _ in range(3):
@@ -122,6 +123,7 @@ def test_a_lost_journal_or_boot_file_brings_no_boot_id_back(path: Path, victims:
         assert bool(journal.incidents) == ("journal.db" in victims)
 
 
+@pytest.mark.fault("journal, boot file or card lost")
 def test_a_new_card_in_an_old_unit_can_begin_at_another_boot_id(path: Path) -> None:
     with Journal(path, "tractor-7", new_boot=1_767_225_600) as journal:
         assert journal.boot == 1_767_225_600
@@ -129,6 +131,7 @@ def test_a_new_card_in_an_old_unit_can_begin_at_another_boot_id(path: Path) -> N
         assert journal.boot == 1_767_225_601
 
 
+@pytest.mark.fault("journal, boot file or card lost")
 def test_a_boot_file_half_written_keeps_the_other_half(tmp_path: Path) -> None:
     file = BootFile(tmp_path / "boot")
     file.write(41)
@@ -139,11 +142,13 @@ def test_a_boot_file_half_written_keeps_the_other_half(tmp_path: Path) -> None:
         assert file.read() == left
 
 
+@pytest.mark.fault("journal of another version, unit or program")
 def test_two_writers_are_refused(path: Path) -> None:
     with Journal(path, "tractor-7"), pytest.raises(JournalError, match=f"in use by process {os.getpid()}"):
         Journal(path, "tractor-7")
 
 
+@pytest.mark.fault("journal of another version, unit or program")
 def test_another_units_journal_is_refused(path: Path) -> None:
     Journal(path, "tractor-7").close()
     with pytest.raises(JournalError, match='belongs to the unit "tractor-7"'):
@@ -167,6 +172,7 @@ WRITER = """
 """
 
 
+@pytest.mark.fault("writer killed", "every acknowledged commit is found, no identity given twice")
 def test_a_killed_writer_loses_no_acknowledged_event_and_no_identity_returns(path: Path) -> None:
     acknowledged: list[tuple[int, int]] = []
     for kill in range(5):
@@ -206,6 +212,7 @@ def truncate(path: Path) -> None:
     os.truncate(path, path.stat().st_size - 5000)
 
 
+@pytest.mark.fault("journal corrupt at the start", "kept aside; what stands on sound pages is saved into a new one; boot ids go on")
 @pytest.mark.parametrize("damage", [damage_header, damage_middle, truncate])
 def test_a_corrupt_journal_is_kept_aside_and_a_new_one_begun(path: Path, damage: Callable[[Path], None]) -> None:
     with Journal(path, "tractor-7") as journal:
@@ -220,6 +227,7 @@ def test_a_corrupt_journal_is_kept_aside_and_a_new_one_begun(path: Path, damage:
     assert read_events(path, after=(2, 0)) == events(1, boot=2)
 
 
+@pytest.mark.fault("journal corrupt at the start")
 def test_what_a_corrupt_journal_still_gives_is_saved(path: Path) -> None:
     with Journal(path, "tractor-7") as journal:
         journal.append(events(500), b"latched")
@@ -231,6 +239,8 @@ def test_what_a_corrupt_journal_still_gives_is_saved(path: Path) -> None:
         assert f"{len(saved)} events saved" in journal.incidents[0]
 
 
+@pytest.mark.fault("journal taken away, corrupted or replaced while running",
+                   "begun anew with the same boot id, told; readers follow")
 def test_corruption_while_running_is_survived_with_the_same_boot_id(path: Path) -> None:
     with Journal(path, "tractor-7") as journal:
         journal.append(events(500), b"")
@@ -243,6 +253,7 @@ def test_corruption_while_running_is_survived_with_the_same_boot_id(path: Path) 
     assert an_event(501) in read_events(path, limit=1000)
 
 
+@pytest.mark.fault("journal taken away, corrupted or replaced while running")
 def test_a_journal_deleted_while_running_is_begun_anew(path: Path) -> None:
     with Journal(path, "tractor-7") as journal:
         journal.append(events(2), b"")
@@ -254,6 +265,7 @@ def test_a_journal_deleted_while_running_is_begun_anew(path: Path) -> None:
         assert (journal.boot, journal.restored_state()) == (2, b"after")
 
 
+@pytest.mark.fault("journal taken away, corrupted or replaced while running")
 def test_a_reader_follows_a_journal_that_was_replaced(path: Path) -> None:
     with Journal(path, "tractor-7") as journal, Reader(path) as reader:
         journal.append(events(2), b"")
@@ -267,6 +279,8 @@ def test_a_reader_follows_a_journal_that_was_replaced(path: Path) -> None:
 # Disks that are slow or full
 
 
+@pytest.mark.fault("disk slow or not answering",
+                   "supervision waits 0.25 s for it, then goes on; events follow, those in memory are bounded")
 def test_a_disk_that_does_not_answer_stops_nothing_and_is_caught_up(path: Path) -> None:
     with Journal(path, "tractor-7", patience_ns=20_000_000) as journal:
         with write_lock(path):
@@ -279,6 +293,7 @@ def test_a_disk_that_does_not_answer_stops_nothing_and_is_caught_up(path: Path) 
     assert read_events(path) == events(2)
 
 
+@pytest.mark.fault("disk slow or not answering")
 def test_what_waits_is_bounded_and_the_loss_counted(path: Path) -> None:
     with Journal(path, "tractor-7", queue_events=10, patience_ns=20_000_000) as journal:
         with write_lock(path):
@@ -360,10 +375,13 @@ def on_small_disk(script: str, folder: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.fault("disk full",
+                   "alarms go on into a reserve of 1 MiB, then wait in memory and leave by radio; all written once there is room")
 def test_a_full_disk_gives_its_reserve_to_alarms_and_recovers(tmp_path: Path) -> None:
     assert "events wait in memory" in on_small_disk(FULL_DISK, tmp_path / "disk")
 
 
+@pytest.mark.fault("disk full")
 def test_nothing_is_lost_when_a_full_disk_is_cleared(tmp_path: Path) -> None:
     on_small_disk(RECOVERY, tmp_path / "disk")
 
@@ -385,11 +403,42 @@ READ_ONLY = """
 """
 
 
+@pytest.mark.fault("disk read-only", "can be read; `ucs run` says what to do and does not start on it")
 def test_a_read_only_disk_can_be_read_and_is_refused_for_writing(tmp_path: Path) -> None:
     printed = on_small_disk(READ_ONLY, tmp_path / "disk")
     assert "can't be written (Read-only file system); make " in printed
 
 
+BROKEN = """
+    import resource, sys
+    from pathlib import Path
+    from level1.io.journal import Journal, read_events
+    from level1.tests.test_journal import eventually, events
+    path = Path(sys.argv[1])
+    with Journal(path, "tractor-7") as journal:
+        assert journal.append(events(3), b"")
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+        assert not journal.append(events(2, first=4), b"locked out")
+        print(journal.fault, len(journal.pending))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        eventually(lambda: journal.fault is None)
+        assert read_events(path) == events(5)
+    with Journal(path, "tractor-7") as journal:
+        assert journal.restored_state() == b"locked out"
+"""
+
+
+@pytest.mark.fault("disk that takes nothing more while running",
+                   "events wait in memory and leave by radio; tried again every second, all written once it works")
+def test_a_disk_that_fails_while_running_is_tried_again(path: Path) -> None:
+    command = [sys.executable, "-c", textwrap.dedent(BROKEN), str(path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "can't be written" in done.stdout and done.stdout.endswith("; 2 events wait in memory 2\n")
+
+
+@pytest.mark.fault("disk read-only")
 @pytest.mark.parametrize("path", ["/proc/ucs/journal.db", "/dev/null/journal.db", "/"])
 def test_a_path_that_cannot_be_written_is_told_in_one_line(path: str) -> None:
     with pytest.raises(JournalError) as error:
@@ -402,6 +451,7 @@ def test_a_path_that_cannot_be_written_is_told_in_one_line(path: str) -> None:
 # Size, versions, other files
 
 
+@pytest.mark.fault("journal over its size bound", "delivered events go first; undelivered ones last, and that is told")
 def test_delivered_events_are_dropped_before_undelivered_ones(path: Path) -> None:
     with Journal(path, "tractor-7", keep_bytes=1_000_000) as journal:
         for first in range(1, 6001, 1000):
@@ -414,6 +464,7 @@ def test_delivered_events_are_dropped_before_undelivered_ones(path: Path) -> Non
     assert journal.incidents == ()
 
 
+@pytest.mark.fault("journal over its size bound")
 def test_undelivered_events_are_dropped_last_and_told(path: Path) -> None:
     with Journal(path, "tractor-7", keep_bytes=1_000_000) as journal:
         journal.append(events(6000), b"")
@@ -423,6 +474,8 @@ def test_undelivered_events_are_dropped_last_and_told(path: Path) -> None:
     assert read_events(path, limit=10**6)[-1] == an_event(6000)
 
 
+@pytest.mark.fault("journal of another version, unit or program",
+                   "an older one is migrated; a later one, another unit's or program's is refused and left alone")
 def test_an_older_file_is_migrated(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Journal(path, "tractor-7") as journal:
         journal.append(events(2), b"old")
@@ -451,6 +504,7 @@ VERSION_1 = f"""
 """As version 1 left it: no commands."""
 
 
+@pytest.mark.fault("journal of another version, unit or program")
 def test_a_file_of_version_1_is_read_as_it_is_and_migrated_by_its_writer(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with sqlite3.connect(path) as old:
@@ -477,6 +531,7 @@ def a_command(after: int, boot: int = 5) -> Commanded:
                      "done", "", frames)
 
 
+@pytest.mark.fault("disk slow or not answering")
 def test_commands_wait_in_memory_as_events_do_and_the_oldest_go_first(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_file, "KEEP_COMMANDS", 10)
     with Journal(path, "tractor-7") as journal:
@@ -494,6 +549,7 @@ def test_commands_wait_in_memory_as_events_do_and_the_oldest_go_first(path: Path
             assert [position for position, _ in reader.commands((1, 13))] == [(1, 14), (1, 15)]
 
 
+@pytest.mark.fault("journal of another version, unit or program")
 def test_a_later_version_is_refused_and_left_alone(path: Path) -> None:
     Journal(path, "tractor-7").close()
     with sqlite3.connect(path) as connection:
@@ -503,6 +559,7 @@ def test_a_later_version_is_refused_and_left_alone(path: Path) -> None:
             refused()
 
 
+@pytest.mark.fault("journal of another version, unit or program")
 def test_another_programs_database_is_refused_and_left_alone(path: Path) -> None:
     path.parent.mkdir()
     with sqlite3.connect(path) as connection:
@@ -515,6 +572,7 @@ def test_another_programs_database_is_refused_and_left_alone(path: Path) -> None
     assert path.read_bytes()[100:] == before[100:]
 
 
+@pytest.mark.fault("journal corrupt at the start")
 def test_an_unreadable_line_is_left_out_and_counted(path: Path) -> None:
     with Journal(path, "tractor-7") as journal:
         journal.append(events(3), b"")

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import msgspec
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -255,6 +256,8 @@ def test_a_command_message_serves_one_repair_at_a_time_and_the_higher_priority_t
     assert target.alarm_states()["PilotFlameOut"] == 2 and target.alarm_states()["Burner"] != 2
 
 
+@pytest.mark.fault("a stop whose message a repair holds",
+                   "no repair moves anything any more; answered that the frame could not be sent")
 def test_a_stop_whose_frame_a_repair_holds_stops_every_repair_all_the_same_and_says_so() -> None:
     target = Supervisor(msgspec.structs.replace(catalog([STATUS, COMMAND], [pilot_flame_out()]), commands={
         name: Command(name, "FLAMER_CMD", {"GasValve": 0, "Igniter": 0}) for name in ("stop", "pause")}), unit="a", broadcast=False)
@@ -271,6 +274,7 @@ def test_a_stop_whose_frame_a_repair_holds_stops_every_repair_all_the_same_and_s
     assert not any(send.data[0] & 1 for send in sends(tool.outputs[-100:], "FLAMER_CMD"))
 
 
+@pytest.mark.fault("an order that reaches supervision late", "refused: expired")
 def test_an_order_that_reaches_supervision_late_is_refused() -> None:
     target = supervisor([STATUS, COMMAND], [pilot_flame_out()], start_ns=0)
     for now, outcome in ((5 * SECOND, "done"), (5 * SECOND + 1, "refused")):

@@ -93,6 +93,7 @@ def test_what_lies_above_a_gap_is_acknowledged_apart(setup: Setup) -> None:
     assert (setup.acks[-1].seq, setup.acks[-1].also) == (2, ((5, 5),))
 
 
+@pytest.mark.fault("events lost or late", "a gap is asked for; what the unit no longer has is told and holds nothing up")
 def test_a_gap_that_stays_is_asked_for_and_its_end_told(setup: Setup) -> None:
     setup.send(1, 5)
     setup.until(lambda: setup.acks and setup.acks[-1].missing)
@@ -103,6 +104,7 @@ def test_a_gap_that_stays_is_asked_for_and_its_end_told(setup: Setup) -> None:
     setup.until(lambda: "is closed" in setup.said[-1])
 
 
+@pytest.mark.fault("events lost or late")
 def test_lost_events_are_told_and_hold_nothing_up(setup: Setup) -> None:
     setup.send(1)
     setup.send(9, prev=1)
@@ -110,6 +112,7 @@ def test_lost_events_are_told_and_hold_nothing_up(setup: Setup) -> None:
     setup.until(lambda: any("has lost its events 2 to 8 of boot 1" in line for line in setup.said))
 
 
+@pytest.mark.fault("level 2's disk takes nothing", "nothing is acknowledged, everything comes again")
 def test_nothing_is_acknowledged_that_could_not_be_stored(setup: Setup) -> None:
     other = sqlite3.connect(setup.store.path, isolation_level=None)
     other.execute("BEGIN IMMEDIATE")
@@ -122,6 +125,7 @@ def test_nothing_is_acknowledged_that_could_not_be_stored(setup: Setup) -> None:
     setup.until(lambda: setup.acks and setup.acks[-1].seq == 1)
 
 
+@pytest.mark.fault("monitoring stops", "told within 2 s, without waiting for the last will")
 def test_a_unit_whose_monitoring_stops_is_told_silent_and_heard_again(setup: Setup) -> None:
     sample = wire.encode(wire.monitor_message(Monitor(UNIT, 1, seconds(5), None, False, "burners", {"a": 1}, {}, {}), 1))
     setup.publish("monitor", sample, "burners")
@@ -138,6 +142,7 @@ def test_connections_are_told_and_greeted(setup: Setup) -> None:
     setup.until(lambda: "tractor-7 is ONLINE, its supervision is not running, 3 events to come" in setup.said)
 
 
+@pytest.mark.fault("malformed, huge or foreign payloads at level 2", "refused, counted, told once")
 @pytest.mark.parametrize("payload", [b"", b"{", b"\xff", b"null", b" " * 100_000, b'{"unit":"tractor-8","boot":1,"seq":1,"t":0}'])
 def test_hostile_payloads_are_refused_once_and_counted(setup: Setup, payload: bytes) -> None:
     setup.publish("alarm", payload)
@@ -148,6 +153,7 @@ def test_hostile_payloads_are_refused_once_and_counted(setup: Setup, payload: by
     assert len([line for line in setup.said if "refused" in line]) == 1
 
 
+@pytest.mark.fault("malformed, huge or foreign payloads at level 2")
 def test_an_event_under_another_units_topic_is_refused(setup: Setup) -> None:
     message = wire.alarm_message(an_event(1), 0, False)
     setup.unit.publish(wire.topic(FLEET, "tractor-8", "alarm"), wire.encode(message), qos=1)

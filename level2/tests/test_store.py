@@ -68,6 +68,7 @@ def test_a_lost_event_that_arrives_after_all_is_stored(tmp_path: Path) -> None:
         assert [event.seq for event in store.events()] == [3, 5]
 
 
+@pytest.mark.fault("an identity given to two events", "both are kept and told")
 def test_two_events_of_one_identity_are_both_kept(tmp_path: Path) -> None:
     with Store(tmp_path / "level2.db") as store:
         assert outcomes(add(store, an_alarm(1, text="one"), an_alarm(1, text="other"))) == [Outcome.NEW, Outcome.CONFLICT]

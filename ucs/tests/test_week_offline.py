@@ -191,6 +191,8 @@ def most_within(times_ns: list[int], span_ns: int) -> int:
     return max(bisect_left(times_ns, t_ns + span_ns) - place for place, t_ns in enumerate(times_ns))
 
 
+@pytest.mark.fault("a week without radio",
+                   "complete, newest first, at most 100 a second of the backlog, monitoring at its period, no memory gathered")
 def test_a_week_offline_drains_without_a_flood_and_newest_first(site: Site) -> None:
     begin_ns = site.clock.t_ns
     for watch in range(WATCHES):
