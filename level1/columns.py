@@ -237,7 +237,6 @@ def changed_payloads(block: Block, rows: Ints, windows: tuple[int, ...]) -> npt.
     """For all rows but the first, whether the payload differs from that of the row before, as far as these windows show."""
     lengths = block.length[rows]
     changed: npt.NDArray[np.bool_] = lengths[1:] != lengths[:-1]
-    for first in windows:
-        words = block.window(rows, first)
+    for words in block.windows(rows, windows).values():
         changed |= words[1:] != words[:-1]
     return changed

@@ -300,7 +300,7 @@ class Passage:
         places = np.flatnonzero(passing.changed)
         rows = passing.rows[places]
         losses = places.searchsorted(lost_places)
-        words = {window: self._block.window(rows, window) for window in {column.bits.window for column in wanted}}
+        words = self._block.windows(rows, {column.bits.window for column in wanted})
         for column in wanted:
             if not (passing.short or passing.lost_places) and column.stays(words[column.bits.window]):
                 continue

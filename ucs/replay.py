@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TextIO
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TextIO
 
 from level1.catalog import NORMAL, Catalog
 from level1.event import Event, Output, Send, encode, seconds
@@ -25,6 +25,9 @@ from ucs.diff import add_season_arguments
 from ucs.remarks import remarks
 from ucs.render import WORDS, event_line, painted, since, wants_colour
 from ucs.trace import Trace
+
+if TYPE_CHECKING:
+    from level1.sieve import Sieve
 
 UNIT, BOOT = "replay", 1
 """Identity of a replay's events; every recording is a run of its own, so that it gives the same bytes beside others."""
@@ -122,15 +125,18 @@ class Replay:
                  blocks: bool | None = None):
         self.log = log
         self.through = through
-        self._blocks = through is None and (log.is_long if blocks is None else blocks)
         self.supervisor = Supervisor(catalog, unit=UNIT, boot=BOOT, armed=armed, broadcast=False)
+        self._sieve: Sieve | None = None
+        if through is None and (log.is_long if blocks is None else blocks):
+            from level1.sieve import Sieve  # numpy takes a tenth of a second to import
+            self._sieve = Sieve(self.supervisor)
         self.counts: Counter[tuple[str, str]] = Counter()
         self.sends = 0
         self.keys: set[int] = set()
 
     def batches(self) -> Iterator[list[Event]]:
         """The events, a list for each batch of frames; ends with the deadlines up to the last time stamp."""
-        for outputs in self._in_blocks() if self._blocks else self._one_by_one():
+        for outputs in self._in_blocks(self._sieve) if self._sieve else self._one_by_one():
             yield self._events(outputs)
         yield self._events(self.supervisor.tick(self.log.last_ns))
 
@@ -141,9 +147,7 @@ class Replay:
             self.keys.update([frame.key for frame in batch])
             yield self.supervisor.receive_many(batch)
 
-    def _in_blocks(self) -> Iterator[Sequence[Output]]:
-        from level1.sieve import Sieve  # numpy takes a tenth of a second to import
-        sieve = Sieve(self.supervisor)
+    def _in_blocks(self, sieve: Sieve) -> Iterator[Sequence[Output]]:
         for block in self.log.blocks():
             self._begin()
             self.keys.update(block.keys)

@@ -2,9 +2,10 @@
 
 candump text (the log form of `candump -l`/`-L` and the screen form with time stamps) and SavvyCAN's GVRET text are read
 here, because their decimal stamps must become exactly as many nanoseconds; BLF, MF4 and pcap by readers of their own
-(`blf_blocks`, `mf4_blocks`, `pcap_blocks`), which read many frames at a time. ASC and TRC go through python-can's readers,
-whose floating-point stamps are rounded to the microsecond (all they hold at today's epoch). NMEA 0183 text of a GNSS receiver
-becomes the frames that the UCS makes of it (`nmea_log`).
+(`blf_blocks`, `mf4_blocks`, `pcap_blocks`), which read many frames at a time. What ASC and TRC say, python-can's readers decide
+(`text_format`), whose floating-point stamps are rounded to the microsecond (all they hold at today's epoch); lines that look like
+others are read in blocks (`text_blocks`). NMEA 0183 text of a GNSS receiver becomes the frames that the UCS makes of it
+(`nmea_log`).
 
 Nothing in a file stops the reading for good: a line that can't be read is skipped, counted and told. Stamps that run
 backwards are handed on as they stand; the supervisor clamps and counts them.
@@ -12,9 +13,7 @@ backwards are handed on as they stand; the supervisor clamps and counts them.
 from __future__ import annotations
 
 import gzip
-import io
 import itertools
-import logging
 import re
 import zlib
 from binascii import unhexlify
@@ -22,7 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, cast
+from typing import TYPE_CHECKING, BinaryIO, cast
 
 from level1.frame import BUS_SHIFT, ERROR, EXTENDED, REMOTE, Frame
 from level1.io.candump import LATEST_NS, candump_line, is_candump
@@ -37,8 +36,6 @@ if TYPE_CHECKING:
 
 TOLD_LINES = 3
 """How many unreadable lines are told in words; all are counted."""
-HOPELESS_LINES = 1000
-"""A file whose first so many lines are all unreadable is given up."""
 BLOCK_ROWS = 1 << 18
 """Frames in a block: enough that what each block costs does not matter, some tens of megabytes of memory."""
 SINGLE_ROWS = 1 << 14
@@ -48,7 +45,6 @@ LONG_BYTES = 1 << 20
 EPOCH_NS = 1_000_000_000 * 10**9
 """Stamps above (9 September 2001) are UTC; below they count from the recording's start."""
 
-_ASC_FRAME = re.compile(r"\s*\d+\.\d+\s")
 _GVRET_HEAD = re.compile(rb"Time Stamp,ID,Extended,(Dir,)?Bus,LEN\b")
 _SUFFIXES = (".asc", ".blf", ".csv", ".mf4", ".trc")
 _PCAP = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\x0a\x0d\x0d\x0a")
@@ -147,7 +143,7 @@ class Log:
             if self.frames_read:
                 self._skip(f"can't be read any further: {reason}")
                 return
-            frames = self._python_can(".mf4", f"an MF4 with {reason}")
+            frames = self._by_asammdf(str(reason))
             while batch := list(itertools.islice(frames, SINGLE_ROWS)):
                 yield Block.of(batch)
 
@@ -231,7 +227,9 @@ class Log:
             self._columns = self._mf4_blocks
             return self._from_blocks
         if suffix:
-            return lambda: self._python_can(suffix)
+            if suffix != ".csv":
+                self._columns = lambda rows: self._text_blocks(suffix, rows)
+            return lambda: self._text(suffix)
         if any(map(is_candump, head.splitlines())):
             self._columns = self._candump_blocks
             return self._candump
@@ -299,25 +297,39 @@ class Log:
             except (ValueError, IndexError) as error:
                 self._skip(f"unreadable line {number}: {error}")
 
-    def _python_can(self, suffix: str, what: str = "") -> Iterator[Frame]:
-        """Any other format, through python-can's reader of that suffix. what: why asammdf is needed for it."""
+    def _text(self, suffix: str) -> Iterator[Frame]:
+        """ASC, TRC and python-can's csv."""
+        from level1.io.text_format import TextFormat
+        for _, t_ns, channel, key, data in TextFormat(self._file, suffix, self._skip).all_frames():
+            yield self._counted(t_ns, key | self.bus(channel) << BUS_SHIFT, data)
+
+    def _text_blocks(self, suffix: str, rows: int) -> Iterator[Block]:
+        from level1.io.text_blocks import TextBlocks, places_of
+        from level1.io.text_format import TextFormat
+        text = TextFormat(self._file, suffix, self._skip)
+        places = places_of(text)
+        if places is not None:
+            yield from self._counted_blocks(TextBlocks(self._file, self.bus, self._skip, text, places).blocks(rows))
+            return
+        from level1.block import Block
+        reads = ((t_ns, key | self.bus(channel) << BUS_SHIFT, data) for _, t_ns, channel, key, data in text.all_frames())
+        while batch := list(itertools.islice(reads, min(rows, SINGLE_ROWS))):
+            yield from self._counted_blocks(iter([Block.of(batch)]))
+
+    def _by_asammdf(self, what: str) -> Iterator[Frame]:
+        """An MF4 that has something we don't read, by asammdf through python-can. what: that."""
         from can.io.player import MESSAGE_READERS
-        reader = MESSAGE_READERS[suffix]
-        first_channel = 1 if suffix == ".asc" else 0  # python-can counts these from 0, the files from 1
-        with _warnings_as(lambda text: self._skip(f"unreadable: {text}")):
-            if suffix == ".mf4":
-                messages = self._binary(reader, what)
-            else:
-                messages = self._text(reader, suffix)
-            for message in messages:
-                channel = message.channel
-                name = str(channel + first_channel if isinstance(channel, int) else channel or "")
-                try:
-                    t_ns, (key, data) = stamp_ns(message.timestamp), from_message(message)
-                except ValueError as error:
-                    self._skip(f"unreadable frame {self.frames_read + self.skipped + 1}: {error}")
-                    continue
-                yield self._counted(t_ns, key | self.bus(name) << BUS_SHIFT, data)
+
+        from level1.io.text_format import stamp_ns
+        for message in self._binary(MESSAGE_READERS[".mf4"], f"an MF4 with {what}"):
+            channel = message.channel
+            name = str(channel if isinstance(channel, int) else channel or "")
+            try:
+                t_ns, (key, data) = stamp_ns(message.timestamp), from_message(message)
+            except ValueError as error:
+                self._skip(f"unreadable frame {self.frames_read + self.skipped + 1}: {error}")
+                continue
+            yield self._counted(t_ns, key | self.bus(name) << BUS_SHIFT, data)
 
     def _binary(self, reader: Callable[..., Iterable[can.Message]], what: str) -> Iterator[can.Message]:
         """Frames of a binary file, up to where it is damaged."""
@@ -330,86 +342,11 @@ class Log:
         except Exception as error:  # whatever bytes make python-can's and asammdf's parsers raise
             self._skip(f"the file ends in the middle or is damaged: {error or type(error).__name__}")
 
-    def _text(self, reader: Callable[..., Iterable[can.Message]], suffix: str) -> Iterator[can.Message]:
-        """Frames of a text file. python-can's readers end at a broken line: begin anew behind it, with the header."""
-        lines = _Lines(self._file, suffix)
-        while True:
-            try:
-                yield from reader(lines)
-                return
-            except (ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError) as error:
-                self._skip(f"unreadable line {lines.number}: {error}")
-                if lines.at_end or (self.skipped >= HOPELESS_LINES and not self.frames_read):
-                    return
-                lines.again()
-
     def _counted(self, t_ns: int, key: int, data: bytes) -> Frame:
         """The frame, counted when it is an error or a remote frame."""
         self.error_frames += bool(key & ERROR)
         self.remote_frames += bool(key & REMOTE)
         return Frame(t_ns, key, data)
-
-
-class _Lines:
-    """Lines of a text file as python-can's readers take them, counted; `again` starts with the header once more."""
-
-    def __init__(self, file: BinaryIO, suffix: str):
-        self._lines = iter(io.TextIOWrapper(file, encoding="utf-8", errors="replace"))
-        self._head, rest = self._split(suffix)
-        self._rest: Iterator[str] = itertools.chain(rest, self._lines)
-        self._read = 0
-        self.at_end = False
-        # The ASC reader swallows one line behind the header, whatever it is; it gets an empty one.
-        self._filler = ["\n"] if suffix == ".asc" else []
-        self._pending: Iterator[str] = itertools.chain(self._head, self._filler)
-
-    @property
-    def number(self) -> int:
-        """Number of the line read last, from 1."""
-        return len(self._head) + self._read
-
-    def again(self) -> None:
-        self._pending = itertools.chain(self._head, self._filler)
-
-    def __iter__(self) -> Iterator[str]:
-        return self
-
-    def __next__(self) -> str:
-        for line in self._pending:
-            return line
-        try:
-            line = next(self._rest)
-        except StopIteration:
-            self.at_end = True
-            raise
-        self._read += 1
-        return line
-
-    def read(self, size: int = -1) -> str:
-        """python-can takes what has `read` and `write` for a file; it reads by lines only."""
-        raise io.UnsupportedOperation("read")
-
-    write = read
-
-    def close(self) -> None:
-        """The owner of the file closes it."""
-
-    def _split(self, suffix: str) -> tuple[list[str], list[str]]:
-        """Header lines, and the first line behind them."""
-        head: list[str] = []
-        for line in self._lines:
-            if (suffix == ".csv" and head) or (suffix == ".trc" and not line.startswith(";")) or (
-                    suffix == ".asc" and _ASC_FRAME.match(line)):
-                return head, [line]
-            head.append(line)
-        return head, []
-
-
-def stamp_ns(stamp_s: float) -> int:
-    """A floating-point stamp of seconds in ns, rounded to the microsecond. Raises ValueError when it can't be one."""
-    if not 0 <= stamp_s < 2**33:
-        raise ValueError(f"time stamp {stamp_s} out of range")
-    return round(stamp_s * 1_000_000) * 1000
 
 
 def _open(path: Path) -> tuple[BinaryIO, int]:
@@ -420,22 +357,3 @@ def _open(path: Path) -> tuple[BinaryIO, int]:
         raise LogError(f"{path}: no such file") from None
     except OSError as error:
         raise LogError(f"{path}: can't be read: {error.strerror}") from None
-
-
-@contextmanager
-def _warnings_as(tell: Callable[[str], Any]) -> Iterator[None]:
-    """Within it, lines that python-can's readers drop with a warning are told to `tell` rather than to the terminal."""
-
-    class Handler(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            if "Failed to parse" in record.msg:
-                tell(record.getMessage())
-
-    logger, handler = logging.getLogger("can.io"), Handler(logging.WARNING)
-    propagate, logger.propagate = logger.propagate, False
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.propagate = propagate

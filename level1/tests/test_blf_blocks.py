@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from level1.frame import BUS_SHIFT, ERROR, EXTENDED, REMOTE, Frame
 from level1.io import blf_blocks
 from level1.io.message import from_message
-from level1.io.replay import Log, stamp_ns
+from level1.io.replay import Log
+from level1.io.text_format import stamp_ns
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 START_S = 1_700_000_000

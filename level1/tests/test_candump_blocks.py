@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from level1.frame import Frame
-from level1.io import candump_blocks
+from level1.io import candump_blocks, line_blocks
 from level1.io.replay import Log, LogError
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
@@ -92,7 +92,7 @@ def test_lines_of_one_kind_are_read_together(tmp_path: Path, monkeypatch: pytest
     asked: list[bytes] = []
     learn = candump_blocks.learn
 
-    def noted(line: bytes) -> candump_blocks.Shape | None:
+    def noted(line: bytes) -> line_blocks.Shape | None:
         asked.append(line)
         return learn(line)
 
@@ -105,7 +105,7 @@ def test_lines_of_one_kind_are_read_together(tmp_path: Path, monkeypatch: pytest
 
 
 def test_blocks_are_of_the_size_asked_for_or_a_chunk_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(candump_blocks, "CHUNK_BYTES", 1000)
+    monkeypatch.setattr(line_blocks, "CHUNK_BYTES", 1000)
     file = tmp_path / "a.log"
     file.write_text("".join(f"({n}.000000) can0 123#{n:04X}\n" for n in range(1000, 3000)))
     sizes = [len(block) for block in Log(file).blocks(100)]
@@ -113,8 +113,8 @@ def test_blocks_are_of_the_size_asked_for_or_a_chunk_more(tmp_path: Path, monkey
 
 
 def test_random_identifiers_end_a_block_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(candump_blocks, "CHUNK_BYTES", 4000)
-    monkeypatch.setattr(candump_blocks, "MOST_TALKERS", 100)
+    monkeypatch.setattr(line_blocks, "CHUNK_BYTES", 4000)
+    monkeypatch.setattr(line_blocks, "MOST_TALKERS", 100)
     text = "".join(f"(1.{n:06d}) can0 {n * 7919:08X}#11\n" for n in range(3000))
     log, frames = both(tmp_path, text.encode())
     assert len(frames) == 3000
@@ -130,7 +130,7 @@ def test_a_packed_recording_that_ends_early(tmp_path: Path, cut: int) -> None:
 
 
 def test_a_line_longer_than_the_buffer_is_one_unreadable_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(candump_blocks, "CHUNK_BYTES", 1000)
+    monkeypatch.setattr(line_blocks, "CHUNK_BYTES", 1000)
     log, frames = both(tmp_path, GOOD + b"x" * 5000 + b"\n" + GOOD + b"#" * 3000 + b"\n" + GOOD + b"y" * 1500)
     assert len(frames) == 3 and log.skipped == 2
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from level1.io import candump_blocks, merged
+from level1.io import line_blocks, merged
 from level1.io.merged import MergedLog
 
 
@@ -33,7 +33,7 @@ def test_blocks_hold_the_frames_that_single_reading_gives(tmp_path_factory: pyte
     files = [write(folder, random, number) for number in range(count)]
     buses = {name: random.randrange(3) for name in random.sample(["can0", "can1", "1.log"], random.randint(0, 2))}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(candump_blocks, "CHUNK_BYTES", 1500)
+        patch.setattr(line_blocks, "CHUNK_BYTES", 1500)
         patch.setattr(merged, "LEAST_ROWS", 1)
         single, blocks = MergedLog(files, buses, one_bus=one_bus), MergedLog(files, buses, one_bus=one_bus)
         assert [frame for block in blocks.blocks(rows) for frame in block.frames()] == list(single.frames())
