@@ -6,7 +6,7 @@ WHEEL_VENV := .venv-wheel
 PACKAGES := level1 bridge firmware_py dbc level2 ucs
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test check test-wheel golden soak clean packages packages-vcan
+.PHONY: help demo test check test-wheel golden coverage soak clean packages packages-vcan
 
 help:
 	@echo "make demo        simulated tractor and implements, faults, repairs, level 2: about a minute"
@@ -14,6 +14,7 @@ help:
 	@echo "make check       ruff, mypy and import rules only"
 	@echo "make test-wheel  the unit tests against the built and installed wheel"
 	@echo "make golden      declare the events that the examples give now (see examples/README.md)"
+	@echo "make coverage    write docs/coverage.md: which tests prove which line of the specification"
 	@echo "make soak        kills, power cuts and forged commands at length: about ten minutes"
 	@echo "make clean       remove what these made"
 
@@ -50,6 +51,9 @@ soak: $(VENV)/ready packages-vcan
 
 golden: $(VENV)/ready
 	$(BIN)/python -m examples.golden
+
+coverage: $(VENV)/ready
+	$(BIN)/python -m hil_tests.coverage
 
 clean:
 	rm -rf $(VENV) $(WHEEL_VENV) dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

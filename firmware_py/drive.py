@@ -47,6 +47,11 @@ class Drive:
         """The pass on which it is; the first is 1."""
         return int(min(self.driven_m, self.length_m - CRAWL_M_S) / self._one_m) + 1
 
+    def fetch(self) -> None:
+        """Somebody has brought it back to the start."""
+        self.driven_m = self.speed_m_s = 0.0
+        self.pose = self._path.at(0)
+
     def advance(self, *, limit_kmh: float, hard: bool, pulls: bool) -> None:
         """One tick. limit_kmh: 0 stands. hard: brake as in a stop. pulls: the engine does."""
         dt_s = self._dt_s

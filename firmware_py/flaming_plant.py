@@ -95,6 +95,11 @@ class Bottle:
         self.kg = 0.0
         self._update()
 
+    def change(self) -> None:
+        """A full one stands in its place, as warm as the air."""
+        self.kg, self.celsius = BOTTLE_KG, self.air_celsius
+        self._update()
+
     def advance(self, dt_s: float, flow_kg_s: float) -> None:
         """Take gas for a moment; temperature and pressure follow every `BOTTLE_STEP_S`."""
         self._flown_kg += flow_kg_s * dt_s

@@ -86,6 +86,7 @@ class FlamingTool(Node):
         Phrase("", "refuses start", "does not start flaming", counted=True),
         Phrase("", "refuses stop", "does not stop flaming", counted=True),
         Phrase("bottle", "empty", "all gas is gone", lasts=False),
+        Phrase("bottle", "changed", "someone brings a full one", lasts=False),
         Phrase("flame_sensor", "stuck on", "always sees a flame"),
         Phrase("flame_sensor", "stuck off", "never sees a flame"),
         Phrase("flame_sensor", WORKS, "sees what there is", lasts=False),
@@ -224,6 +225,8 @@ class FlamingTool(Node):
                 self._mode.jam(("Off",), statement.commands)
             case "bottle", "empty":
                 self.plant.bottle.empty()
+            case "bottle", "changed":
+                self.plant.bottle.change()
             case "flame_sensor", action:
                 self._sensor.stuck = {"stuck on": True, "stuck off": False}.get(action)
             case "wind", "gust":

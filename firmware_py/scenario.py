@@ -30,6 +30,7 @@ from typing import Any
 from firmware_py.airblast_mission import AirblastMission
 from firmware_py.airblast_sprayer import AirblastSprayer
 from firmware_py.codec import Codec
+from firmware_py.computer import Computer
 from firmware_py.fault import WORKS, Phrase, Statement
 from firmware_py.flaming_tool import FlamingTool
 from firmware_py.mission_controller import MissionController
@@ -45,7 +46,7 @@ from firmware_py.vehicle_mission import VehicleMission
 
 Program = (type[FlamingTool] | type[MissionController] | type[SprayerBoom] | type[SprayerMission] | type[PathDriver]
            | type[AirblastSprayer] | type[AirblastMission] | type[UltrasonicSensors]
-           | type[Vehicle] | type[VehicleMission])
+           | type[Vehicle] | type[VehicleMission] | type[Computer])
 PROGRAMS: Mapping[str, Program] = {
     "flaming_tool": FlamingTool,
     "mission_controller": MissionController,
@@ -57,6 +58,7 @@ PROGRAMS: Mapping[str, Program] = {
     "airblast_mission": AirblastMission,
     "vehicle": Vehicle,
     "vehicle_mission": VehicleMission,
+    "computer": Computer,
 }
 KEYS = ("title", "seed", "duration", "nodes", "orders", "faults")
 DEFAULT_DURATION_NS = 60_000_000_000

@@ -203,7 +203,10 @@ class SprayerBoom(Node):
         works = remote and wanted == "On" and "SPRAYER_CMD" not in self._gated and self.boom.state == "Open"
         if not self.powered:
             self._mode.force("Off")
+        sprayed = self.spraying
         self._mode.advance(t_ns, "On" if works else "Off")
+        if sprayed and not self.spraying:  # the supply of all drivers falls off: one more try to close for each valve
+            self._again.update(range(1, SECTIONS + 1))
         if remote:
             self._take_over(t_ns)
         self._switch(t_ns, works and self.spraying)

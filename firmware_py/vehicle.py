@@ -104,6 +104,7 @@ class Vehicle(Node):
         Phrase("gnss", WORKS, "RTK fixed again", lasts=False),
         Phrase("stop_switch", "pressed", "somebody presses it"),
         Phrase("stop_switch", WORKS, "is released; the vehicle stays stopped", lasts=False),
+        Phrase("path", "loaded", "somebody brings it back to the start of its path and loads the mission anew", lasts=False),
         Phrase("start_button", "pressed", "somebody at the machine ends a stop", lasts=False),
         Phrase("", "manual", "somebody takes the wheel"),
         *COMMON_FAULTS,
@@ -468,6 +469,9 @@ class Vehicle(Node):
                 self.fix = {"lost": "NoFix", "float": "RtkFloat"}.get(action, "RtkFixed")
             case "stop_switch", action:
                 self._pressed = action == "pressed"
+            case "path", _:
+                self.drive.fetch()
+                self.mission = "Loaded"
             case "start_button", "pressed":
                 if self.controller == "Stopped" and not self._pressed:
                     self._ready()

@@ -128,6 +128,7 @@ def lose_the_flame() -> None:
             time.sleep(0.1)
 
 
+@pytest.mark.covers("CanBusDown", "raised", "cleared")
 def test_a_link_that_goes_down_is_an_alarm_until_it_is_up(run: Process, plug: Plug) -> None:
     plug.down()
     run.expect("CanBusDown +raised", IN_TIME_S)

@@ -110,6 +110,7 @@ def journal(folder: Path, alarm: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in told.splitlines()]
 
 
+@pytest.mark.covers("Ultrasonic3NotWorking", "raised", "repair_started", "repaired", "cleared")
 def test_a_dead_sensor_is_reset_by_nmt_and_verified_by_its_heartbeat(run: Process, simulate: Callable[..., Process]) -> None:
     sprayer = simulate("sprayer", "mission")
     sensors = simulate("sensors", faults='"at 12 s: sensors.sensor[3] dead"')
@@ -125,6 +126,8 @@ def test_a_dead_sensor_is_reset_by_nmt_and_verified_by_its_heartbeat(run: Proces
     assert not any("Silent" in line for line in run.out), "a reset that was ordered is no silence"
 
 
+@pytest.mark.covers("DeviceSilent", "raised", "cleared")
+@pytest.mark.covers("UltrasonicSilent", "raised")
 def test_a_device_that_dies_is_told_as_silent_and_cleared_when_it_is_back(
         run: Process, simulate: Callable[..., Process], tmp_path: Path) -> None:
     simulate("sprayer", "mission")
@@ -146,12 +149,14 @@ def test_a_device_that_dies_is_told_as_silent_and_cleared_when_it_is_back(
     assert events[0]["text"] == "Ultrasonic sensors (node 43): no heartbeat for 1.75 s"
 
 
+@pytest.mark.covers("UltrasonicNotOperational", "raised", "repaired")
 def test_level_1_starts_devices_that_nobody_started(run: Process, simulate: Callable[..., Process], peer: Peer) -> None:
     simulate("sensors")
     run.expect("UltrasonicNotOperational +raised", START_S)
     run.expect("UltrasonicNotOperational +repaired", SLOW_S)
 
 
+@pytest.mark.covers("DeviceEmergency", "raised", "cleared")
 def test_emergencies_and_error_history_of_a_node_by_the_package(run: Process, peer: Peer, tmp_path: Path) -> None:
     device = peer.device(SPRAYER)
     device.set_data(0x1003, 1, (0x3120).to_bytes(4, "little"))

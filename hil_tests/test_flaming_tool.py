@@ -8,18 +8,15 @@ from __future__ import annotations
 import os
 import re
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
-import can
 import pytest
 
 from hil_tests.conftest import ROOT, RUNNING, UCS, Process
-from level1.catalog import LOCKED_OUT, NORMAL, REPAIRING, Message
-from level1.decode import raw_of
+from hil_tests.recorder import Recorder
+from level1.catalog import LOCKED_OUT, NORMAL, REPAIRING
 from level1.io.definitions import load
 
 pytestmark = pytest.mark.vcan
@@ -56,48 +53,6 @@ program = "mission_controller"
 """
 BLOWN_OUT = '"at 6 s: flamer.pilot blown out"'
 DEAD_TOO = f'"at 5 s: flamer.igniter dead", {BLOWN_OUT}'
-
-
-class Heard(NamedTuple):
-    """A frame on a bus. t_s: monotonic."""
-
-    t_s: float
-    can_id: int
-    data: bytes
-
-
-class Recorder:
-    """What was on a bus."""
-
-    def __init__(self, channel: str, messages: dict[str, Message]):
-        self.frames: list[Heard] = []
-        self._messages = messages
-        self._bus = can.Bus(channel=channel, interface="socketcan")
-        self._stopping = False
-        self._thread = threading.Thread(target=self._read)
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._stopping = True
-        self._thread.join()
-        self._bus.shutdown()
-
-    def values(self, message: str, signal: str) -> list[tuple[float, int | float | None]]:
-        """Time and raw value of a signal in each frame of a message."""
-        definition = self._messages[message]
-        wanted = definition.signal(signal)
-        return [(frame.t_s, raw_of(wanted, frame.data)) for frame in list(self.frames) if frame.can_id == definition.can_id]
-
-    def changes(self, message: str, signal: str) -> list[int | float | None]:
-        """The values of a signal, one after the other."""
-        values = [value for _, value in self.values(message, signal)]
-        return [value for place, value in enumerate(values) if not place or value != values[place - 1]]
-
-    def _read(self) -> None:
-        while not self._stopping:
-            message = self._bus.recv(0.2)
-            if message is not None:
-                self.frames.append(Heard(time.monotonic(), message.arbitration_id, bytes(message.data)))
 
 
 class Tractor:
@@ -170,6 +125,7 @@ def field(running: Field, request: pytest.FixtureRequest) -> Field:
     return running
 
 
+@pytest.mark.covers("PilotFlameOut", "raised", "repair_started", "repaired", "cleared")
 def test_a_flame_blown_out_is_lit_again_and_level_2_hears_it_all(field: Field) -> None:
     level2, run = field.level2, field.windy.run
     run.expect("PilotFlameOut +raised", START_S)
@@ -201,6 +157,7 @@ def test_the_bus_shows_the_alarms_life_and_who_commands(field: Field) -> None:
     field.windy.node.expect("commands again: working", 5)
 
 
+@pytest.mark.covers("PilotFlameOut", "raised", "repair_started", "repair_failed", "locked_out")
 def test_with_a_dead_igniter_three_attempts_end_in_a_lock_out_at_level_2(field: Field) -> None:
     level2, run = field.level2, field.broken.run
     for attempt in (1, 2, 3):

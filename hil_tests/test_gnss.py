@@ -83,6 +83,7 @@ def run(tmp_path: Path, talker: Talker, process: Callable[..., Process]) -> Proc
     return started
 
 
+@pytest.mark.covers("GnssNoFix", "raised", "cleared")
 def test_no_fix_is_told_with_the_time_of_the_satellites_and_over(run: Process, talker: Talker, tmp_path: Path) -> None:
     talker.bodies = (NO_FIX,)
     run.expect("GnssNoFix +raised", WAIT_S)
@@ -114,6 +115,7 @@ def test_where_the_unit_is_stands_on_the_bus(run: Process, talker: Talker) -> No
     assert run.returncode is None
 
 
+@pytest.mark.covers("GnssNoData", "raised", "cleared")
 def test_the_plug_is_pulled_and_put_in_again(run: Process, talker: Talker, tmp_path: Path) -> None:
     for _ in range(3):
         with talker.interrupted():

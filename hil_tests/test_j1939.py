@@ -51,6 +51,7 @@ def engine() -> Iterator[socket.socket]:
         yield peer
 
 
+@pytest.mark.covers("TroubleCode", "raised", "cleared")
 def test_the_kernels_broadcast_in_packets_is_understood(supervisor: Any, engine: socket.socket) -> None:
     engine.sendto(dm1(100, 110, 190), ("vcan0", socket.J1939_NO_NAME, DM1, socket.J1939_NO_ADDR))
     for spn in (100, 110, 190):

@@ -23,6 +23,8 @@ name = "tractor-7"
 name = "tractor"
 channel = "vcan0"
 dbc = ["ucs.dbc"]
+[repairs]
+armed = ["TrafficLogFailed"]
 [recorder]
 path = "traffic"
 max_mb = 10
@@ -72,7 +74,8 @@ def test_what_was_heard_and_said_can_be_read_from_the_recording(run: Process, tm
     assert abs(frames[0].t_ns / 1e9 - time.time()) < 120
 
 
-def test_a_recorder_that_can_not_write_is_an_alarm_until_it_can(run: Process, tmp_path: Path) -> None:
+@pytest.mark.covers("TrafficLogFailed", "raised", "repair_started", "repaired", "cleared")
+def test_a_recorder_that_can_not_write_is_an_alarm_and_begins_anew_when_it_can(run: Process, tmp_path: Path) -> None:
     def chatter(seconds: float) -> None:
         with can.Bus(channel="vcan0", interface="socketcan") as bus:
             for _ in range(int(seconds * 20)):
@@ -84,11 +87,13 @@ def test_a_recorder_that_can_not_write_is_an_alarm_until_it_can(run: Process, tm
     chatter(6)
     run.expect("traffic recorder .*traffic: not recorded .*trying again", WAIT_S)
     run.expect("TrafficLogFailed +raised", WAIT_S)
+    run.expect("TrafficLogFailed +repair started", WAIT_S)
     (tmp_path / "traffic").unlink()
     chatter(8)
     run.expect("traffic recorder .*traffic: works again", WAIT_S)
+    run.expect("TrafficLogFailed +repaired", WAIT_S)
     run.expect("TrafficLogFailed +cleared", WAIT_S)
     assert run.stop() == 0
-    assert [event.event for event in read_events(tmp_path / "journal.db") if event.alarm == "TrafficLogFailed"] == [
-        "raised", "cleared"]
+    life = [event.event for event in read_events(tmp_path / "journal.db") if event.alarm == "TrafficLogFailed"]
+    assert (life[:2], life[-2:]) == (["raised", "repair_started"], ["repaired", "cleared"])
     assert list((tmp_path / "traffic").glob("*.blf")) and list((tmp_path / "away").glob("*.blf"))

@@ -17,10 +17,14 @@ from level1.decode import raw_range, reserved
 from level1.navigation import DAY_NS, FIXES, MEASURED, Navigation
 
 HEALTH, LOAD = "UCS_HEALTH", "UCS_LOAD"
+LOG_ORDER, TIME_ORDER = "UCS_LOG_CMD", "UCS_TIME_CMD"
+"""Messages by which repairs ask the UCS itself to begin a new traffic log, and to get the time again."""
 POSITION, MOTION, STATUS, TIME = "UCS_GNSS_POSITION", "UCS_GNSS_MOTION", "UCS_GNSS_STATUS", "UCS_GNSS_TIME"
 HOST_MESSAGES = (HEALTH, LOAD)
 GNSS_MESSAGES = {"position": POSITION, "motion": MOTION, "status": STATUS, "time": TIME}
 """Message of each topic that a receiver speaks of (`nmea.TOPICS`)."""
+READINGS = frozenset((*HOST_MESSAGES, *GNSS_MESSAGES.values()))
+"""Messages in which the UCS tells what it has measured."""
 HEARTBEAT_NS = 900_000_000
 """A message without news is sent again after this: before its cycle time of 1 s is over."""
 BUS_STATES = ("BusActive", "BusWarning", "BusPassive", "BusOff", "BusDown")

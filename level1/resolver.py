@@ -38,6 +38,7 @@ from level1.expression import (
     TroubleCode,
     WaitStep,
 )
+from level1.health import READINGS
 from level1.language import LanguageError, Name, Syntax
 from level1.scaling import exact_decimal, float_bits, physical, plain
 
@@ -478,13 +479,15 @@ class _Resolution:
             case language.Expect(condition=condition, within=within):
                 node = self.condition(condition)
                 self._check_senders(condition)
-                return ExpectStep(node, within.ns, text[condition.start:condition.end].strip()) if node else None
+                said = text[syntax.start:within.start].strip().removeprefix("expect").removesuffix("within").strip()
+                return ExpectStep(node, within.ns, said) if node else None
         raise TypeError(type(syntax).__name__)
 
     def _check_senders(self, condition: Syntax) -> None:
-        """What a repair expects has to be told by somebody else, or it proves nothing."""
+        """What a repair expects has to be told by somebody else or measured, or it proves nothing."""
         pairs = [(name, pair) for name in language.names(condition) if (pair := self.scope.only(name))]
-        if any(set(message.senders) - {"UCS"} or self.scope.is_alarm(message, signal) for _, (message, signal) in pairs):
+        if any(set(message.senders) - {"UCS"} or message.name in READINGS or self.scope.is_alarm(message, signal)
+               for _, (message, signal) in pairs):
             return
         for name, (message, _) in pairs:
             if not message.senders:

@@ -4,6 +4,8 @@ Theory of operation. One thread opens the port, reads, and opens it again every 
 an exception at the next read; a socket by an empty one). It never ends by itself. Sentences are put together and turned into
 readings in this thread, so that the loop only takes what is ready; when the loop does not, the oldest are dropped and counted.
 
+`reopen` (the repair of TimeSyncLost) has a port opened anew that is there, but whose adapter or driver may hang.
+
 A port that is not there at the start is no reason not to supervise: it is an alarm.
 """
 from __future__ import annotations
@@ -68,7 +70,7 @@ class GnssReceiver:
         self._offset_ns: int | None = None
         self._fix: tuple[int, int | None] = (clock(), None)
         self._lock = threading.Lock()
-        self._stopping = threading.Event()
+        self._stopping, self._again = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"gnss {settings.port}", daemon=True)
 
     @property
@@ -91,6 +93,10 @@ class GnssReceiver:
         self._stopping.set()
         if self._thread.ident is not None:
             self._thread.join()
+
+    def reopen(self) -> None:
+        """Have the port closed and opened again soon."""
+        self._again.set()
 
     def take(self) -> list[Reading]:
         """The readings since the last call, in order."""
@@ -119,6 +125,10 @@ class GnssReceiver:
 
     def _poll(self) -> set[str]:
         """Wait for bytes; the topics with news. Raises what a lost port makes the driver raise."""
+        if self._again.is_set():
+            self._again.clear()
+            self._close()
+            self._notice(f"gnss {self.settings.port}: opened anew, to get the time")
         if self._line is None:
             self._line = self._opener(self.settings)
             self._navigator.opened(self._clock())

@@ -73,6 +73,9 @@ class Link(Protocol):
 class Tap(Protocol):
     """What the loop needs of `level1.io.recorder.Recorder`; never blocks."""
 
+    def reopen(self) -> None:
+        """Begin a new file."""
+
     def record(self, frames: Sequence[Frame] | Sequence[Send]) -> None:
         """Record what was received or sent."""
 
@@ -82,6 +85,9 @@ class Receiver(Protocol):
 
     def take(self) -> Sequence[Reading]:
         """The readings since the last call."""
+
+    def reopen(self) -> None:
+        """Have the line opened anew."""
 
     def utc_offset_ns(self) -> int | None:
         """UTC minus the monotonic clock by the satellites, None: not known."""
@@ -292,6 +298,7 @@ class Live:
         self._follow(sends)
         for send in sends:
             self.ports[send.key >> BUS_SHIFT].send(send, now_ns)
+            self._obey(send)
         if sends and self._recorder is not None:
             self._recorder.record(sends)
         retries = [retry for port in self.ports if (retry := port.flush(now_ns)) is not None]
@@ -301,6 +308,15 @@ class Live:
         for event in events:
             self._told(event)
         self._tell_journal()
+
+    def _obey(self, send: Send) -> None:
+        """Orders of repairs to this program itself."""
+        if send.message.partition("@")[0] == health.LOG_ORDER and self._recorder is not None:
+            self._recorder.reopen()
+        elif send.message.partition("@")[0] == health.TIME_ORDER:
+            self._trust_due_ns = 0
+            if self._gnss is not None:
+                self._gnss.reopen()
 
     def _tell_journal(self) -> None:
         for incident in self.journal.incidents[self._incidents:]:

@@ -4,7 +4,8 @@ Theory of operation. The loop only puts batches into a bounded queue. A thread o
 frames at a time with a nap between, so that the interpreter is never busy with it for long. Files are numbered; a full one
 is followed by the next, and the oldest goes when all together would exceed the bound, or when the disk has no more than
 `RESERVE_BYTES` left: alarms need that space, recordings don't. Whatever goes wrong is told (`fault`), the damaged end of
-the file is cut off, and a new file is tried every `RETRY_NS`.
+the file is cut off, and a new file is tried every `RETRY_NS`, or at once when the
+repair of TrafficLogFailed asks for it (`reopen`).
 
 A power cut loses what the last container holds, a few seconds; the file is readable up to there.
 """
@@ -67,7 +68,7 @@ class Recorder:
         self._file: _File | None = None
         self._unsafe = 0
         self._lock = threading.Lock()
-        self._filled, self._stopping = threading.Event(), threading.Event()
+        self._filled, self._stopping, self._renewed = threading.Event(), threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="traffic recorder", daemon=True)
 
     @property
@@ -91,6 +92,11 @@ class Recorder:
         self._filled.set()
         if self._thread.ident is not None:
             self._thread.join(STOP_S)
+
+    def reopen(self) -> None:
+        """Close the file and begin a new one with the next frame, without waiting for the time of the next try."""
+        self._renewed.set()
+        self._filled.set()
 
     def record(self, frames: Sequence[Frame] | Sequence[Send]) -> None:
         """Record frames received (`Frame`) or sent (`Send`). Never waits for the disk."""
@@ -119,10 +125,14 @@ class Recorder:
     def _round(self) -> None:
         """Write what waits, if the disk lets it; else drop it and say so."""
         now_ns = self._clock()
-        if self._fault is not None and now_ns < self._retry_ns:
+        renewed = self._renewed.is_set()
+        if self._fault is not None and now_ns < self._retry_ns and not renewed:
             self._forget(self._waiting())
             return
         try:
+            if renewed:
+                self._renewed.clear()
+                self._begin_anew()
             if self._file is not None and not self._file.in_place:
                 self._file.abandon()
                 self._file = None
@@ -142,7 +152,15 @@ class Recorder:
             return
         if self._fault is not None and self._file is not None:
             self._fault = None
+            self._dropped_ns = None  # what was dropped meanwhile was told as this fault
             self._notice(f"traffic recorder {self.folder}: works again")
+
+    def _begin_anew(self) -> None:
+        """Close the file; the next frame begins another. Raises OSError when the disk does not take the end of this one."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+        self._notice(f"traffic recorder {self.folder}: begins a new file")
 
     def _portion(self) -> list[Frame | Send]:
         with self._lock:

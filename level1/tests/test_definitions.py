@@ -368,6 +368,13 @@ def test_a_repair_is_resolved_to_steps_of_raw_values() -> None:
     assert (repair.moves, repair.local_reset, repair.text) == (True, True, steps)
 
 
+def test_what_a_repair_expects_is_told_with_its_parentheses() -> None:
+    said = "(Flame == Off or Pressure > 3) and (Flame == On or Pressure < 2)"
+    repair = alarm(Repair=f"send CMD(Valve=Closed); expect  {said}  within 1 s").repair
+    assert repair is not None and isinstance(repair.steps[1], ExpectStep)
+    assert repair.steps[1].text == said
+
+
 def test_a_repair_may_move_nothing_and_be_reset_from_above() -> None:
     repair = alarm(Repair="send CMD(Valve=Closed)", RepairMoves=0, RepairReset=1).repair
     assert repair and (repair.moves, repair.local_reset, repair.attempts) == (False, False, 1)

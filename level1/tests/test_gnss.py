@@ -95,6 +95,22 @@ def test_a_quiet_receiver_gives_signs_of_life_that_say_so(plug: Plug, bench: Cal
     assert one.last(POSITION, "GnssLatitude") is None and one.last(STATUS, "GnssFix") is None
 
 
+def test_its_line_is_opened_anew_when_it_is_asked_to(plug: Plug, bench: Callable[..., Bench]) -> None:
+    opened: list[Line] = []
+
+    def opener(settings: Gnss) -> Line:
+        opened.append(open_line(settings))
+        return opened[-1]
+    one = bench(Gnss(str(plug.path)), opener)
+    one.until(lambda: one.last(STATUS, "GnssReceiver") == "Receiving", lambda: plug.say(FIX))
+    one.receiver.reopen()
+    one.until(lambda: len(opened) == 2)
+    one.readings.clear()
+    one.until(lambda: one.last(STATUS, "GnssReceiver") == "Receiving", lambda: plug.say(FIX))
+    assert one.notices == [f"gnss {plug.path}: opened anew, to get the time"]
+    assert not one.receiver.counters["lost"]
+
+
 @pytest.mark.parametrize("half", [0, 30])
 def test_unplugged_and_plugged_again_and_again(plug: Plug, bench: Callable[..., Bench], half: int) -> None:
     one = bench(Gnss(str(plug.path)))

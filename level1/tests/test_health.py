@@ -283,6 +283,9 @@ class Fixed:
     def record(self, frames: Sequence[Any]) -> None:
         self.recorded += frames
 
+    def reopen(self) -> None:
+        pass
+
 
 class Computer(Fixed):
     """A computer whose measurements the test gives."""
@@ -295,6 +298,9 @@ class Receiver(Fixed):
     def take(self) -> list[Reading]:
         readings, self.readings = self.readings, []
         return readings
+
+    def reopen(self) -> None:
+        pass
 
 
 class TestHousekeeping:

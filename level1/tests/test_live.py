@@ -20,6 +20,8 @@ from level1.command import Order
 from level1.decode import encode
 from level1.event import Commanded, Event, Monitor, Result, Send, SentFrame
 from level1.frame import ERROR, EXTENDED, Frame, frame_key
+from level1.gate import Gate
+from level1.health import Reading
 from level1.io import live
 from level1.io.can import WAITING_SENDS, BusError, Interface, Port, open_bus
 from level1.io.config import Bus
@@ -657,6 +659,36 @@ class TestLive:
         unit.port._wire = wire = Direct()
         unit.turn_at(1_002)
         assert wire.filters is not None and (EXTENDED | 0x80, 0xC000_00FF) in wire.filters
+
+    def test_orders_of_repairs_to_the_ucs_itself_are_obeyed_where_they_are_sent(self) -> None:
+        class Part:
+            """Stands for the recorder or the receiver."""
+
+            def __init__(self) -> None:
+                self.asked = 0
+
+            def reopen(self) -> None:
+                self.asked += 1
+
+            def record(self, frames: Sequence[Frame] | Sequence[Send]) -> None:
+                pass
+
+            def take(self) -> Sequence[Reading]:
+                return ()
+
+            def utc_offset_ns(self) -> int | None:
+                return None
+        catalog, log = load(["ucs.dbc"]), Part()
+        unit, gnss = Unit(catalog), Part()
+        unit.live._recorder, unit.live._gnss = log, gnss
+        supervisor = unit.live.supervisor
+        supervisor.gate = Gate(catalog, supervisor.sendable(), frozenset({"UCS_HEALTH"}))
+        calm = {"TrafficLog": 0, "TimeSync": 1}
+        unit.turn_at(1_000)
+        for second in range(2, 200):
+            raws = calm if second < 10 else {"TrafficLog": 1, "TimeSync": 0}
+            unit.live._deliver(list(supervisor.publish(second * 1_000 * MS, "UCS_HEALTH", raws)))
+            assert (log.asked, gnss.asked) == (int(second >= 12) + (second >= 30) + (second >= 48), int(second >= 130))
 
     def test_on_a_busy_bus_it_naps_and_on_a_quiet_one_it_does_not(self, catalog: Catalog) -> None:
         naps: list[float] = []

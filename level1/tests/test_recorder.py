@@ -180,12 +180,11 @@ def test_a_disk_that_takes_no_more_is_told_and_recording_goes_on_when_it_does(be
     one.recorder.record(noise(10, 3))
     one.until(lambda: len(one.notices) == 2)
     assert one.notices[1].endswith("works again")
+    assert one.recorder.fault is None, "at once: a repair waits for it"
     one.recorder.stop()
     whole = [bytes(message.data) for path in one.files() for message in messages(path)]
     first = [frame.data for frame in noise(5_000)]
     assert whole[:4000] == first[:4000] and whole[-10:] == [frame.data for frame in noise(10, 3)]
-    one.now_ns += module.TOLD_NS
-    assert one.recorder.fault is None
 
 
 def test_the_space_for_alarms_stays_free(bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -241,6 +240,31 @@ def test_a_folder_taken_away_while_recording_is_made_anew(tmp_path: Path, bench:
     one.until(lambda: one.files())
     one.recorder.stop()
     assert len(messages(one.files()[0])) == 100 and one.recorder.fault is None
+
+
+def test_it_begins_a_new_file_when_it_is_asked_to_and_loses_nothing(bench: Callable[..., Bench]) -> None:
+    one = bench()
+    one.recorder.record(noise(10))
+    one.until(lambda: one.drained() and one.files())
+    one.recorder.reopen()
+    one.until(lambda: one.notices)
+    one.recorder.record(noise(10, 1))
+    one.until(lambda: len(one.files()) == 2)
+    one.recorder.stop()
+    assert [len(messages(path)) for path in one.files()] == [10, 10]
+    assert one.notices == [f"traffic recorder {one.folder}: begins a new file"] and one.recorder.dropped == 0
+
+
+def test_asked_to_it_tries_again_at_once(tmp_path: Path, bench: Callable[..., Bench]) -> None:
+    (tmp_path / "gone").write_text("")
+    one = bench(tmp_path / "gone" / "traffic")
+    assert one.recorder.fault
+    (tmp_path / "gone").unlink()
+    (tmp_path / "gone").mkdir()
+    one.recorder.reopen()
+    one.recorder.record(noise(10))
+    one.until(lambda: one.recorder.fault is None)
+    assert len(one.files()) == 1, "the clock stands: it did not wait"
 
 
 KILLED = """

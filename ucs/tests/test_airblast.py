@@ -24,6 +24,7 @@ from level1.supervisor import Supervisor
 from ucs.main import main
 from ucs.simulate import SHIPPED, load
 from ucs.simulated_unit import SimulatedUnit
+from ucs.tests.proof import proves
 
 SECOND = 1_000_000_000
 NODES = "".join(f'[nodes.{name}]\nprogram = "{program}"\n' for name, program in (
@@ -141,19 +142,33 @@ TABLE: list[tuple[str, Lives]] = [
 ]
 
 
-@pytest.mark.parametrize(("fault", "lives"), TABLE, ids=[fault for fault, _ in TABLE])
+@pytest.mark.parametrize(("fault", "lives"), [proves(lives, fault, lives) for fault, lives in TABLE],
+                         ids=[fault for fault, _ in TABLE])
 def test_each_fault_raises_its_alarms_and_no_others(catalog: Catalog, fault: str, lives: Lives) -> None:
     field = orchard(catalog, fault).run()
     assert {alarm: field.life(alarm) for alarm in sorted(field.raised)} == lives
     assert "repair_started" not in [event.event for event in field.events if event.alarm in REPORTED]
 
 
-@pytest.mark.parametrize("sensor", range(1, 9))
+@pytest.mark.parametrize("sensor", [proves({f"Ultrasonic{n}NotWorking": REPAIRED}, n) for n in range(1, 9)])
 def test_each_sensor_has_its_alarm_and_its_repair(catalog: Catalog, sensor: int) -> None:
     field = orchard(catalog, f"at 10 s: sensors.sensor[{sensor}] dead").run(18)
     assert field.life(f"Ultrasonic{sensor}NotWorking") == REPAIRED
     emergency = next(event for event in field.events if event.alarm == "DeviceEmergency")
     assert emergency.text.startswith(f"Ultrasonic sensors (node 43): sensor {sensor} gives no echo")
+
+
+@pytest.mark.parametrize("lives", [proves(lives, lives) for lives in [
+    {f"Ultrasonic{n}NotWorking": LOCKED_OUT for n in range(1, 9)}]], ids=["each"])
+def test_each_sensor_that_no_reset_helps_is_locked_out(catalog: Catalog, lives: Lives) -> None:
+    field = orchard(catalog, "at 10 s: sensors.sensor broken", duration="3 min").run()
+    assert {alarm: field.life(alarm) for alarm in sorted(field.raised) if alarm in lives} == lives
+
+
+@pytest.mark.covers("AirblastTankCritical", "raised", "cleared")
+def test_a_tank_that_is_filled_again_is_no_alarm_any_more(catalog: Catalog) -> None:
+    field = orchard(catalog, "at 12 s: sprayer.tank empty", "at 25 s: sprayer.tank filled").run()
+    assert (field.life("AirblastTankCritical"), field.life("AirblastTankLow")) == (PASSED, PASSED)
 
 
 def test_every_alarm_of_the_definition_is_raised_by_some_fault(catalog: Catalog) -> None:
@@ -214,6 +229,7 @@ def test_a_sensor_that_is_locked_out_does_not_keep_the_others_from_being_repaire
     assert field.life("Ultrasonic5NotWorking") == REPAIRED
 
 
+@pytest.mark.covers("Ultrasonic1NotWorking", "locked_out", "cleared")
 def test_a_locked_out_sensor_can_be_reset_at_the_machine_once_it_works(catalog: Catalog) -> None:
     field = orchard(catalog, "at 10 s: sensors.sensor[1] broken for 20 s").run(25)
     assert "still there" in field.reset("Ultrasonic1NotWorking")
@@ -229,6 +245,7 @@ def test_the_sprayer_works_on_while_the_sensors_are_reset(catalog: Catalog) -> N
         assert field.simulation.now_ns < 4 * SECOND or field.sprayer.plant.flow_l_min > 20
 
 
+@pytest.mark.covers("NoMainFlow", "locked_out", "cleared")
 def test_a_blocked_line_ends_with_the_sprayer_off_and_a_reset_with_a_new_order_starts_it_again(catalog: Catalog) -> None:
     field = orchard(catalog, "at 10 s: sprayer.line blocked for 40 s", orders=("at 2 s: spraying on", "at 70 s: spraying on"),
                     duration="80 s").run(50)

@@ -26,6 +26,7 @@ from level1.supervisor import Supervisor
 from ucs.main import main
 from ucs.simulate import SHIPPED
 from ucs.simulated_unit import SimulatedUnit
+from ucs.tests.proof import proves
 
 SECOND = 1_000_000_000
 CODEC = Codec.shipped("sprayer_boom.dbc", "isobus_tractor.dbc")
@@ -34,7 +35,7 @@ NODES = '[nodes.sprayer]\nprogram = "sprayer_boom"\n{settings}\n[nodes.mission]\
 WORK = ("at 1 s: boom open", "at 2 s: spraying on", "at 3 s: section on")
 """With the boom unfolded at the start: all sections spray from about 5 s on."""
 FOLDED, UNFOLDED = "", "boom_open = true"
-SECTION_ALARMS = {f"Section{n}NotSet" for n in range(1, SECTIONS + 1)}
+SECTION_ALARMS = tuple(f"Section{n}NotSet" for n in range(1, SECTIONS + 1))
 REPAIRED = ["raised", "repair_started", "repaired", "cleared"]
 
 
@@ -157,6 +158,8 @@ def test_the_mission_uses_what_the_patches_need(mission: tuple[Work, Sprayed]) -
     assert 8 - whole.sprayer.plant.dis_l == pytest.approx(0.02 * tank.used_l, rel=0.1)
 
 
+@pytest.mark.covers("monitoring: sprayer boom implement")
+@pytest.mark.covers("monitoring: sprayer boom nozzles")
 def test_monitoring_says_on_or_off_of_the_implement_and_of_each_valve(mission: tuple[Work, Sprayed]) -> None:
     samples = [output for output in mission[0].outputs if isinstance(output, Monitor)]
     nozzles = [sample.values for sample in samples if sample.message == "nozzles"]
@@ -281,12 +284,14 @@ TABLE = [
     Case("Section1NotSet", ("at 8 s: sprayer.valve[1] slow",), REPAIRED, (*WORK, "at 10 s: section[1] off"), also=NOZZLES),
     Case("ChangeNozzlesFailure", ("at 8 s: sprayer.valve[12] stuck closed for 1 command",), ["raised", "cleared"],
          also=frozenset({"Section12NotSet"})),
+    Case("SectionStaysOpen", ("at 8 s: sprayer.valve[7] stuck open for 7 commands",), REPAIRED, SECTION_OFF,
+         also=NOZZLES | {"Section7NotSet"}),
     Case("SectionStaysOpen", ("at 8 s: sprayer.valve[7] stuck open",), failed(1, "locked_out"), SECTION_OFF,
          also=NOZZLES | {"Section7NotSet"}),
 ]
 
 
-@pytest.mark.parametrize("case", TABLE, ids=str)
+@pytest.mark.parametrize("case", [proves({case.alarm: case.life}, case) for case in TABLE], ids=map(str, TABLE))
 def test_each_fault_has_its_alarm_repair_and_clearing(catalog: Catalog, case: Case) -> None:
     done = work(catalog, *case.faults, orders=case.orders, settings=case.settings, duration=case.duration, seed=4).run()
     assert done.life(case.alarm) == case.life
@@ -294,7 +299,7 @@ def test_each_fault_has_its_alarm_repair_and_clearing(catalog: Catalog, case: Ca
 
 
 def test_every_alarm_and_every_fault_stand_in_the_table(catalog: Catalog) -> None:
-    alarms = {case.alarm for case in TABLE} | SECTION_ALARMS
+    alarms = {case.alarm for case in TABLE} | set(SECTION_ALARMS)
     assert set(catalog.alarms) == alarms
     said = " ".join(fault for case in TABLE for fault in case.faults)
     for phrase in SprayerBoom.FAULTS:
@@ -324,15 +329,26 @@ def test_what_is_within_the_response_times_raises_nothing(catalog: Catalog, faul
 # --- repairs ------------------------------------------------------------------------------------------------------------------
 
 
-def test_sections_are_repaired_side_by_side_each_by_its_own_message(catalog: Catalog) -> None:
+@pytest.mark.parametrize("life", [proves(dict.fromkeys(SECTION_ALARMS, REPAIRED), REPAIRED)], ids=["each"])
+def test_sections_are_repaired_side_by_side_each_by_its_own_message(catalog: Catalog, life: list[str]) -> None:
     all_stuck = work(catalog, "at 1 s: sprayer.valve stuck closed for 1 command").run()
-    assert all(all_stuck.life(alarm) == REPAIRED for alarm in SECTION_ALARMS)
+    assert {alarm: all_stuck.life(alarm) for alarm in SECTION_ALARMS} == dict.fromkeys(SECTION_ALARMS, life)
     started = [event for event in all_stuck.events if event.event == "repair_started"]
     assert [[frame.message for frame in event.frames] for event in started] == [
         [f"SPRAYER_SECTION_{event.alarm.removeprefix('Section').removesuffix('NotSet')}"] for event in started]
     assert all(all_stuck.sprayer.sections_open)
 
 
+@pytest.mark.parametrize("life", [proves(dict.fromkeys(SECTION_ALARMS, failed(3, "locked_out")), failed(3, "locked_out"))],
+                         ids=["each"])
+def test_each_section_that_stays_stuck_is_locked_out(catalog: Catalog, life: list[str]) -> None:
+    all_stuck = work(catalog, "at 1 s: sprayer.valve stuck closed").run()
+    assert {alarm: all_stuck.life(alarm) for alarm in SECTION_ALARMS} == dict.fromkeys(SECTION_ALARMS, life)
+    assert all_stuck.sprayer.locked == set(range(1, SECTIONS + 1))
+
+
+@pytest.mark.covers("ChangeNozzlesFailure", "raised", "cleared")
+@pytest.mark.covers("Section7NotSet", "locked_out", "cleared")
 def test_a_locked_out_section_is_closed_and_left_out_until_someone_resets_it(catalog: Catalog) -> None:
     stuck = work(catalog, "at 8 s: sprayer.valve[7] stuck closed for 20 s", duration="60 s").run(35)
     assert stuck.life("Section7NotSet")[-1] == "locked_out"
@@ -346,6 +362,7 @@ def test_a_locked_out_section_is_closed_and_left_out_until_someone_resets_it(cat
     assert all(stuck.sprayer.sections_open)
 
 
+@pytest.mark.covers("SectionStaysOpen", "raised", "locked_out", "cleared")
 def test_a_section_that_can_not_be_closed_ends_spraying(catalog: Catalog) -> None:
     stuck = work(catalog, "at 8 s: sprayer.valve[7] stuck open for 40 s", orders=(*SECTION_OFF, "at 65 s: spraying on"),
                  duration="75 s").run(45)
@@ -365,7 +382,7 @@ def test_a_section_that_can_not_be_closed_ends_spraying(catalog: Catalog) -> Non
 LOCKED = [case for case in TABLE if case.life[-1] == "locked_out" and "Section" not in case.alarm]
 
 
-@pytest.mark.parametrize("case", LOCKED, ids=str)
+@pytest.mark.parametrize("case", [proves({case.alarm: [*case.life, "cleared"]}, case) for case in LOCKED], ids=map(str, LOCKED))
 def test_a_lock_out_is_safe_and_can_be_reset_at_the_machine(catalog: Catalog, case: Case) -> None:
     end_s = 60 if "boom blocked" in case.faults[0] else 38
     lasting = [f"{fault} for {end_s - 9} s" for fault in case.faults]

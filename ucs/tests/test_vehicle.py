@@ -29,6 +29,7 @@ from ucs.main import main
 from ucs.nmea_line import nmea_line
 from ucs.simulate import SHIPPED, load
 from ucs.simulated_unit import SimulatedUnit
+from ucs.tests.proof import proves
 
 SECOND = 1_000_000_000
 FILES = ("vehicle.dbc", "isobus_tractor.dbc", "ucs.dbc")
@@ -100,11 +101,20 @@ def farm(catalog: Catalog, *faults: str, orders: Sequence[str] = WORK, duration:
 # --- missions -----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.covers("MissionFinished", "raised")
 def test_a_healthy_mission_raises_nothing_but_that_it_is_finished(catalog: Catalog) -> None:
     done = farm(catalog, duration="10 min", orders=(*WORK, "at 9 min: pto off", "at 9 min: implement unset")).run()
     assert [(event.alarm, event.event) for event in done.events] == [("MissionFinished", "raised")]
     assert done.tractor.drive.passage == 7
     assert done.tractor.controller == "Ready"
+
+
+@pytest.mark.covers("MissionFinished", "raised", "cleared")
+def test_the_next_mission_ends_that_the_last_one_is_finished(catalog: Catalog) -> None:
+    twice = farm(catalog, "at 2 min: tractor.path loaded", settings='passes = "1 passes"', duration="4 min",
+                 orders=(*WORK, "at 2 min: mission start")).run()
+    assert twice.life("MissionFinished") == ["raised", "cleared", "raised"]
+    assert twice.raised == {"MissionFinished"}
 
 
 @pytest.mark.parametrize("name", sorted(file.name for file in SHIPPED.glob("vehicle_*.toml")))
@@ -175,6 +185,8 @@ def test_no_sequence_of_orders_raises_an_alarm_of_a_healthy_vehicle(catalog: Cat
 # --- monitoring ---------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.covers("monitoring: vehicle controller")
+@pytest.mark.covers("monitoring: vehicle motion")
 def test_monitoring_tells_controller_and_motion_every_250_ms_and_a_lost_position_has_no_value(catalog: Catalog) -> None:
     text = f'orders = {list(WORK)}\nfaults = ["at 20 s: tractor.gnss lost"]\n' + NODES.format("")
     seen = Farm(catalog, text, monitor_ns=SECOND // 4).run(15)
@@ -200,7 +212,7 @@ def test_monitoring_tells_controller_and_motion_every_250_ms_and_a_lost_position
 
 REPAIRED = ["raised", "repair_started", "repaired", "cleared"]
 LOCKED = ["raised", *["repair_started", "repair_failed"] * 2, "locked_out"]
-TABLE = [
+TABLE: list[tuple[str, list[str], list[str], set[str] | None]] = [
     ("UnitNotMoving", ["at 20 s: tractor.engine dies"], ["raised"], {"UnitNotMoving"}),
     ("UnitNotMoving", ["at 20 s: tractor.wheels blocked for 8 s"], ["raised", "cleared"], {"UnitNotMoving"}),
     ("UnitNotMoving", ["at 20 s: tractor.wheels blocked"], ["raised"], {"UnitNotMoving"}),
@@ -227,12 +239,15 @@ TABLE = [
     ("PositionInaccurate", ["at 20 s: tractor.gnss float for 20 s"], ["raised", "cleared"], {"PositionInaccurate"}),
     ("OilPressureSensorFault", ["at 20 s: tractor.oil_sensor unplugged for 20 s"], ["raised", "cleared"],
      {"OilPressureSensorFault", "EngineWarningLamp", "TroubleCode"}),
+    ("TroubleCode", ["at 20 s: tractor.oil_sensor unplugged for 20 s"], ["raised", "cleared"],
+     {"OilPressureSensorFault", "EngineWarningLamp", "TroubleCode"}),
     ("CoolantHot", ["at 5 s: tractor.coolant leaks for 90 s"], ["raised", "cleared"], {"CoolantHot", "CoolantCritical"}),
     ("ChargingVoltageLow", ["at 20 s: tractor.alternator dead for 40 s"], ["raised", "cleared"], {"ChargingVoltageLow"}),
 ]
 
 
-@pytest.mark.parametrize(("alarm", "faults", "life", "others"), TABLE, ids=lambda value: str(value)[:60])
+@pytest.mark.parametrize(("alarm", "faults", "life", "others"), [proves({row[0]: row[2]}, *row) for row in TABLE],
+                         ids=[f"{alarm}: {', '.join(faults)}" for alarm, faults, *_ in TABLE])
 def test_each_fault_raises_its_alarm_and_no_other(catalog: Catalog, alarm: str, faults: list[str], life: list[str],
                                                   others: set[str] | None) -> None:
     orders = (*WORK, "at 51 s: pto off", "at 51 s: implement unset")
@@ -261,6 +276,7 @@ def test_a_reset_of_the_vehicles_computer_brakes_and_switches_off(catalog: Catal
     assert reset.raised <= {"VehicleSilent"}
 
 
+@pytest.mark.covers("UnitStopped", "raised", "cleared")
 def test_a_stop_by_switch_is_ended_at_the_machine_and_clears(catalog: Catalog) -> None:
     faults = ("at 20 s: tractor.stop_switch pressed for 5 s", "at 40 s: tractor.start_button pressed")
     unit = farm(catalog, *faults, orders=(*WORK, "at 45 s: mission start")).run(30)
@@ -313,6 +329,7 @@ def test_after_a_stop_pto_and_implement_stay_off_until_ordered_anew(catalog: Cat
     assert stopped.run(70).tractor.pto.state == "On"
 
 
+@pytest.mark.covers("PtoNotSet", "locked_out", "cleared")
 def test_a_lock_out_pauses_the_mission_and_can_be_reset(catalog: Catalog) -> None:
     orders = (*WORK, "at 90 s: mission resume", "at 95 s: pto on")
     locked = farm(catalog, "at 0 s: tractor.pto refuses for 60 s", orders=orders).run(70)
@@ -343,6 +360,7 @@ def test_pause_and_resume_brake_and_go_on(catalog: Catalog) -> None:
     assert unit.raised == set()
 
 
+@pytest.mark.covers("UnitStopped", "raised", "cleared")
 def test_stop_brakes_harder_and_is_released_at_the_machine_only(catalog: Catalog) -> None:
     unit = farm(catalog, orders=(*WORK, "at 40 s: mission start")).run(20)
     before_m = unit.tractor.drive.driven_m
