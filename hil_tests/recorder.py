@@ -1,6 +1,7 @@
 """What was on a bus: for tests of what programs send."""
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Mapping
@@ -36,6 +37,11 @@ class Recorder:
         self._stopping = True
         self._thread.join()
         self._bus.shutdown()
+
+    @property
+    def longest_pause_s(self) -> float:
+        """The longest time without any frame."""
+        return max((after.t_s - before.t_s for before, after in itertools.pairwise(self.frames)), default=0.0)
 
     def values(self, message: str, signal: str) -> list[tuple[float, int | float | None]]:
         """Time and raw value of a signal in each frame of a message."""

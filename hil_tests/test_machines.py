@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ pytestmark = pytest.mark.vcan
 
 START_S = 40.0
 LENGTH_S = 25.0
+RUNS, STOOD_STILL_S = 3, 0.25
 LATE_S = 25.0
 """Programs start slowly in a guest without CPU of its own."""
 UNIT = """
@@ -44,6 +46,8 @@ GNSS = """
 [gnss]
 port = "gnss"
 """
+URGENT = -15
+"""Nice value of programs that have begun."""
 REPAIRED = ("raised", "repair_started", "repaired", "cleared")
 PASSED = ("raised", "cleared")
 
@@ -129,11 +133,13 @@ class Unit:
         self.run = self._start("run", f"{plan.name}.toml")
 
     def work(self) -> None:
-        """Let the machines begin, once level 1 is there."""
-        self.run.expect("; supervising$", START_S)
+        """Let the machines begin; back when they have begun."""
+        prefer(self.run)
         self.recorder = Recorder(self.plan.channel, self.catalog.messages)
         nmea = ("--nmea", "gnss") if self.plan is ORCHARD else ()
         self.machines = self._start("simulate", f"{self.plan.name}.scenario.toml", "--bus", self.plan.channel, *nmea)
+        self.machines.expect(" order: ", START_S)
+        prefer(self.machines)
 
     def end(self) -> None:
         """Wait until the machines have ended, end level 1, read its journal."""
@@ -155,6 +161,12 @@ class Unit:
         return self._started[-1]
 
 
+def prefer(process: Process) -> None:
+    """Let it go before programs that are still being loaded: what has begun lives by time limits of some 100 ms."""
+    with suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, process.pid, URGENT)
+
+
 class Work:
     """Both units, which have worked."""
 
@@ -162,6 +174,8 @@ class Work:
         self.processes: list[Process] = []
         try:
             self.units = {plan.name: Unit(plan, folder, self.processes) for plan in (ORCHARD, FIELD)}
+            for unit in self.units.values():
+                unit.run.expect("; supervising$", START_S)
             for unit in self.units.values():
                 unit.work()
             for unit in self.units.values():
@@ -172,9 +186,14 @@ class Work:
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Work]:
-    """The work of both units, for all tests of this module."""
-    yield Work(tmp_path_factory.mktemp("machines"))
+def done(tmp_path_factory: pytest.TempPathFactory) -> Work:
+    """The work of both units, for all tests of this module. A run in which the whole guest stood still (its buses were quiet longer
+    than any message's time limit) proves nothing about level 1, and is done again."""
+    for _ in range(RUNS):
+        work = Work(tmp_path_factory.mktemp("machines"))
+        if all(unit.recorder.longest_pause_s < STOOD_STILL_S for unit in work.units.values()):
+            break
+    return work
 
 
 def proved(plan: Plan, fault: Fault) -> Any:
@@ -187,8 +206,7 @@ def test_each_fault_is_told_repaired_on_the_wire_verified_and_cleared(
         done: Work, name: str, fault: Fault, request: pytest.FixtureRequest) -> None:
     request.node.stash[RUNNING] = done.processes
     unit = done.units[name]
-    words = [event.event for event in unit.episode(fault.alarm)]
-    assert [word for word in dict.fromkeys(words) if word != "repair_failed"] == list(fault.life), "a slow guest may need two tries"
+    assert [event.event for event in unit.episode(fault.alarm)] == list(fault.life)
     alarm = unit.catalog.alarms[fault.alarm]
     shown = [{"raised": ACTIVE, "repair_started": REPAIRING, "repaired": ACTIVE, "cleared": NORMAL}[word] for word in fault.life]
     assert unit.recorder.changes(alarm.message, alarm.signal)[:len(shown) + 1] == [NORMAL, *shown]
