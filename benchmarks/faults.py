@@ -17,9 +17,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from benchmarks import page
+
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "reliability.md"
-BEGIN, END = "<!-- faults: python -m benchmarks.faults --write -->", "<!-- end of faults -->"
 OUT = "UCS_FAULTS_OUT"
 """Environment of the pytest run: where the plugin writes."""
 
@@ -47,17 +48,16 @@ def gather(run: bool) -> tuple[list[Fault], str]:
     return msgspec.convert(found, list[Fault]), done.stdout + done.stderr
 
 
-def table(faults: list[Fault]) -> str:
+def table(faults: list[Fault]) -> list[str]:
     """The table in Markdown."""
-    rows = (f"| {fault.fault} | {fault.outcome} | {fault.cases} in {', '.join(f'`{file}`' for file in fault.files)} |\n"
+    rows = (f"| {fault.fault} | {fault.outcome} | {fault.cases} in {', '.join(f'`{file}`' for file in fault.files)} |"
             for fault in faults)
-    return f"| fault | what comes of it | tests |\n|---|---|---|\n{''.join(rows)}"
+    return ["| fault | what comes of it | tests |", "|---|---|---|", *rows]
 
 
 def put_into_page(faults: list[Fault]) -> None:
     """Replace the table in docs/reliability.md."""
-    before, mark, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-    PAGE.write_text(f"{before}{mark}\n{table(faults)}{END}{rest.partition(END)[2]}", encoding="utf-8")
+    page.put("faults", table(faults), PAGE)
 
 
 # The plugin
@@ -98,7 +98,7 @@ def main() -> int:
     if not faults or any(fault.passed < fault.cases for fault in faults):
         print(text, file=sys.stderr)
         return 1
-    print(table(faults))
+    print(*table(faults), sep="\n")
     if args.write:
         put_into_page(faults)
     return 0

@@ -1,7 +1,8 @@
 """A fleet at one receiver: `python -m benchmarks.fleet` runs 2,000 simulated units at 4 Hz against mosquitto and `level2`.
 
 Each unit is an MQTT connection of its own that sends a monitoring message every 250 ms and an event every 10 s, and sends the
-event again until it is acknowledged. Prints loss, delay from the unit's stamp to the receiver's disk or memory, CPU and memory.
+event again until it is acknowledged. Prints loss, delay from the unit's stamp to the receiver's disk or memory, CPU and memory;
+`--write` puts them into docs/performance.md.
 """
 from __future__ import annotations
 
@@ -20,6 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from benchmarks import page
 from bridge import wire
 from bridge.mqtt import Address
 from level1.event import Event, Monitor, seconds
@@ -207,6 +209,7 @@ def main() -> int:
     parser.add_argument("--units", type=int, default=2000)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--fleet-process", type=int, metavar="PORT", help="(the fleet's own process)")
+    parser.add_argument("--write", action="store_true", help="write docs/performance.md")
     args = parser.parse_args()
     if args.fleet_process:
         units(args.units, args.fleet_process, args.seconds)
@@ -218,6 +221,7 @@ def main() -> int:
         thread.start()
         command = [sys.executable, "-m", "benchmarks.fleet", "--units", str(args.units), "--seconds", str(args.seconds)]
         before = cpu_s(os.getpid()), cpu_s(broker)
+        load = os.getloadavg()[0]
         fleet = subprocess.run([*command, "--fleet-process", str(port)], capture_output=True, text=True, check=True)
         used = cpu_s(os.getpid()) - before[0], cpu_s(broker) - before[1]
         memory = resident_mb(os.getpid()), resident_mb(broker)
@@ -225,14 +229,22 @@ def main() -> int:
         thread.join()
         samples, events, acknowledged = map(int, fleet.stdout.split())
         stored = store.count("event")
-    print(f"{args.units} units at 4 Hz for {args.seconds:g} s, one receiver")
-    print(f"monitoring: {samples} sent, {samples - len(receiver.delays_ns)} lost; delay {_delays(receiver.delays_ns)}")
-    print(f"events: {events} sent, {stored} stored, {acknowledged} acknowledged; delay to level 2's disk "
-          f"{_delays(receiver.event_delays_ns)}")
-    for who, cpu, resident in zip(("receiver", "broker"), used, memory, strict=True):
-        print(f"{who}: {cpu / args.seconds:.0%} of a core, {resident:.0f} MB")
-    silent = [line for line in receiver.quiet if "silent" in line]
-    print(f"told silent while sending: {len(silent)}")
+    spent = os.times()
+    silent = sum("silent" in line for line in receiver.quiet)
+    lines = [
+        f"| {args.units} units at 4 Hz for {args.seconds:g} s | |", "|---|---|",
+        f"| monitoring messages | {samples} sent, {samples - len(receiver.delays_ns)} lost |",
+        f"| their age when taken in | {_delays(receiver.delays_ns)} |",
+        f"| events | {events} sent, {stored} stored, {acknowledged} acknowledged |",
+        f"| their age on level 2's disk | {_delays(receiver.event_delays_ns)} |",
+        f"| units told silent while they sent | {silent} |",
+        *(f"| {who} | {cpu / args.seconds:.0%} of a core, {resident:.0f} MB |"
+          for who, cpu, resident in zip(("receiver", "broker (mosquitto)"), used, memory, strict=True)),
+        f"| the simulated units | {(spent.children_user + spent.children_system) / args.seconds:.0%} of a core |",
+        f"| load of the machine before | {load:.1f} on {os.cpu_count()} cores |"]
+    print(*lines, sep="\n")
+    if args.write:
+        page.put("fleet", lines)
     return 0 if stored == events == acknowledged and len(receiver.delays_ns) == samples else 1
 
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from benchmarks import faults, nats, powercut
+from benchmarks import faults, nats, page, powercut
 from benchmarks.chain import peak_kb
 from bridge import wire
 from bridge.gate import Gate, Passed, Refused
@@ -32,7 +32,6 @@ from level2.store import Store
 from ucs.tests.chain import Chain, an_event, eventually
 
 PAGE = Path(__file__).parents[1] / "docs" / "reliability.md"
-BEGIN, END = "<!-- counts: python -m benchmarks.soak --write -->", "<!-- end of counts -->"
 S = 1_000_000_000
 
 
@@ -215,11 +214,8 @@ def _progress(text: str) -> None:
 
 def put_into_page(rows: list[Row]) -> None:
     """Replace the counts in docs/reliability.md; the rest of the page is written by hand."""
-    before, mark, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-    after = rest.partition(END)[2]
-    lines = "".join(f"| {row.fault} | {row.often} | {row.outcome} |\n" for row in rows)
-    table = f"| fault | how often | outcome |\n|---|---|---|\n{lines}"
-    PAGE.write_text(f"{before}{mark}\n{table}{END}{after}", encoding="utf-8")
+    lines = (f"| {row.fault} | {row.often} | {row.outcome} |" for row in rows)
+    page.put("counts", ["| fault | how often | outcome |", "|---|---|---|", *lines], PAGE)
 
 
 def main() -> int:

@@ -135,6 +135,26 @@ def test_a_unit_whose_monitoring_stops_is_told_silent_and_heard_again(setup: Set
     setup.until(lambda: "tractor-7 is heard again" in setup.said)
 
 
+@pytest.mark.fault("level 2's own disk is slow", "acknowledged later; no unit is told silent for it")
+def test_no_unit_is_told_silent_because_our_own_disk_is_slow(setup: Setup) -> None:
+    sample = wire.encode(wire.monitor_message(Monitor(UNIT, 1, seconds(5), None, False, "burners", {"a": 1}, {}, {}), 1))
+    other = sqlite3.connect(setup.store.path, isolation_level=None)
+    setup.publish("monitor", sample, "burners")
+    setup.until(lambda: setup.receiver.counters["monitor"])
+    other.execute("BEGIN IMMEDIATE")
+    setup.send(1)
+    while not any("nothing is acknowledged" in line for line in setup.said):  # for a second, SQLite's patience
+        setup.publish("monitor", sample, "burners")
+        setup.unit.wait(0)
+        time.sleep(0.05)
+    setup.publish("monitor", sample, "burners")
+    before = setup.receiver.counters["monitor"]
+    setup.until(lambda: setup.receiver.counters["monitor"] > before)
+    other.execute("ROLLBACK")
+    other.close()
+    assert not any("is silent:" in line for line in setup.said), setup.said
+
+
 def test_connections_are_told_and_greeted(setup: Setup) -> None:
     message = wire.Connection(unit=UNIT, boot=1, seq=1, t=seconds(1), state="ONLINE", supervising=False, waiting=3)
     setup.publish("connection", wire.encode(message))
