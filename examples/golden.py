@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import difflib
 import gzip
+import hashlib
 import io
 import json
 import os
@@ -29,9 +30,20 @@ HERE = Path(__file__).parent
 SHARED = HERE.parents[1] / "shared" / "data"
 """Recordings of real machines, on some machines beside the project's folder; never part of it."""
 SUMMARY = HERE / "recorded.json"
-SHARED_FOLDERS, SHARED_DBC = ("jd5055e-tractor", "canboat-nmea2000"), "isobus_tractor.dbc"
+SHARED_DBC = ("isobus_tractor.dbc", "ucs.dbc")
 MOST_LINES = 30
-Summary = dict[str, dict[str, list[int]]]
+
+
+class Recorded(NamedTuple):
+    """What a recording gives: frames, SHA-256 of the lines of its events, and of each alarm how often it was raised and how often
+    it stood at the end."""
+
+    frames: int
+    events: str
+    alarms: dict[str, list[int]]
+
+
+Summary = dict[str, Recorded]
 DECLARE = "If this change is meant, declare it: run `make golden`, look at `git diff examples`, and commit them with the change."
 
 
@@ -93,9 +105,9 @@ def changed(example: Example, golden: bytes, now: bytes) -> str:
 
 
 def summary(folder: Path, names: Iterable[str]) -> Summary:
-    """Of each of these recordings that can be read, each alarm's count: raised, and standing at the end."""
+    """Of each of these recordings that can be read, what it gives."""
     found: Summary = {}
-    catalog = season.encoded(load([SHARED_DBC]))
+    catalog = season.encoded(load(SHARED_DBC))
     for name in names:
         outcome = season.work(season.Job(str(folder / name), catalog))
         if not outcome.error:
@@ -104,18 +116,23 @@ def summary(folder: Path, names: Iterable[str]) -> Summary:
                 count = counts.setdefault(span.alarm, [0, 0])
                 count[0] += 1
                 count[1] += span.end is None
-            found[name] = dict(sorted(counts.items()))
+            digest = hashlib.sha256(b"\n".join(outcome.events)).hexdigest()
+            found[name] = Recorded(outcome.frames, digest, dict(sorted(counts.items())))
     return found
 
 
 def real_recordings(folder: Path = SHARED) -> list[str]:
     """Those of real machines that are on this machine, by their names in the folder."""
-    present = [str(folder / each) for each in SHARED_FOLDERS if (folder / each).is_dir()]
-    return [os.path.relpath(name, folder) for name in season.recordings(present)]
+    return [os.path.relpath(name, folder) for name in season.recordings([str(folder)])]
+
+
+def declared_summary() -> Summary:
+    """What is declared of recordings of real machines."""
+    return {name: Recorded(*each) for name, each in json.loads(SUMMARY.read_text()).items()}
 
 
 def changed_summary(golden: Summary, now: Summary, present: Collection[str]) -> str:
-    """Which counts changed, in words; empty when none did. present: recordings that are there; others can't be judged, nor
+    """What changed, in words; empty when nothing did. present: recordings that are there; others can't be judged, nor
     those that nobody has declared."""
     found = []
     for name in sorted(golden.keys() & set(present)):
@@ -123,9 +140,14 @@ def changed_summary(golden: Summary, now: Summary, present: Collection[str]) -> 
         if new is None:
             found.append(f"{name}: can no longer be read")
             continue
-        found += [f"{name}: {alarm}: {_count(old.get(alarm))} → {_count(new.get(alarm))}" for alarm in sorted({*old, *new})
-                  if old.get(alarm) != new.get(alarm)]
-    return "\n".join(["the alarms of real recordings changed (as declared → now):", *found, DECLARE]) if found else ""
+        told = [f"{name}: {alarm}: {_count(old.alarms.get(alarm))} → {_count(new.alarms.get(alarm))}"
+                for alarm in sorted({*old.alarms, *new.alarms}) if old.alarms.get(alarm) != new.alarms.get(alarm)]
+        if old.frames != new.frames:
+            told.append(f"{name}: {old.frames} frames → {new.frames}")
+        if not told and old.events != new.events:
+            told.append(f"{name}: the same alarms, as often, but their events are others: `ucs replay --events` shows them")
+        found += told
+    return "\n".join(["the events of real recordings changed (as declared → now):", *found, DECLARE]) if found else ""
 
 
 def _count(count: Sequence[int] | None) -> str:

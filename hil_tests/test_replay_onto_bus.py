@@ -94,7 +94,7 @@ def told(name: str, off: list[float]) -> str:
 
 def test_each_frame_goes_out_at_its_time_as_canplayer_does_it(
         process: Callable[..., Process], ear: Ear, log: Path, record_property: Callable[[str, object], None]) -> None:
-    play = process("replay", log, "--speed", "1", "--onto", "vcan0")
+    play = process("replay", log, "--speed", "1", "--bus", "vcan0")
     assert play.wait(START_S) == 0
     ours = list(ear.frames)
     assert [frame.can_id for frame in ours] == [0x100 + n for n in range(FRAMES)], "all, in order, without the error frame"

@@ -52,13 +52,14 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--plot", metavar="OUT.png", help="draw what the alarms look at, the alarms and their repairs (also .svg, "
                         ".pdf); of several recordings a picture each, OUT-NAME.png")
     parser.add_argument("--unit-toml", metavar="FILE", help="which repairs are armed, which files belong to which bus")
-    parser.add_argument("--bus", action="append", default=[], metavar="NAME=INDEX", type=_bus,
-                        help="take this channel of the recording (with --merge also: this file) as the bus of that index (from 0)")
+    parser.add_argument("--bus", action="append", default=[], metavar="NAME=INDEX|[CHANNEL=]INTERFACE", type=_bus,
+                        help="take this channel of the recording (with --merge also: this file) as the bus of that index (from 0); "
+                        "or, with the name of an interface, the same as --onto")
     parser.add_argument("--onto", action="append", default=[], metavar="[CHANNEL=]INTERFACE", type=onto.target,
                         help="play the recording onto this bus, such as vcan0, in real time; --dbc may be left out then")
-    parser.add_argument("--speed", type=onto.speed, metavar="N", help="with --onto: so many times faster than recorded (1)")
-    parser.add_argument("--interface", metavar="NAME", help=f"with --onto: any interface of python-can ({onto.INTERFACE})")
-    parser.add_argument("--bitrate", type=int, metavar="N", help="with --onto: bit/s, for interfaces that need it")
+    parser.add_argument("--speed", type=onto.speed, metavar="N", help="onto a bus: so many times faster than recorded (1)")
+    parser.add_argument("--interface", metavar="NAME", help=f"onto a bus: any interface of python-can ({onto.INTERFACE})")
+    parser.add_argument("--bitrate", type=int, metavar="N", help="onto a bus: bit/s, for interfaces that need it")
     parser.add_argument("--scalar", action="store_true", help="read and evaluate frame by frame; slower, with the same events")
     parser.add_argument("--merge", action="store_true", help="the recordings are of one drive: one run, in the order of time")
     add_season_arguments(parser)
@@ -66,6 +67,8 @@ def add_parser(commands: Any) -> None:
 
 def run(args: Namespace) -> int:
     """Replay every recording; 2 when one could not be used."""
+    channels = {name: place for name, place in args.bus if isinstance(place, int)}
+    args.onto += [(name, place) for name, place in args.bus if isinstance(place, str)]
     unit = config.load(args.unit_toml) if args.unit_toml else None
     if not args.dbc and unit is None and not args.onto:
         raise OutsideError("no definitions: give --dbc FILE …, or --unit-toml FILE")
@@ -80,7 +83,7 @@ def run(args: Namespace) -> int:
     if unit:
         config.check_armed(unit, catalog)
     task = _Task(catalog, tuple(unit.repairs.armed) if unit else None,
-                 {**(_bus_names(unit) if unit and not args.dbc else {}), **dict(args.bus)}, tuple(name for name, _ in args.bus),
+                 {**(_bus_names(unit) if unit and not args.dbc else {}), **channels}, tuple(channels),
                  False if args.scalar else None)
     if args.onto:
         return _run_onto(paths, task, args)
@@ -227,12 +230,12 @@ def _check_onto(args: Namespace, paths: Sequence[str]) -> None:
     """Whether what belongs to `--onto` fits together. Raises OutsideError."""
     if not args.onto:
         if args.speed or args.interface or args.bitrate:
-            raise OutsideError("--speed, --interface and --bitrate need the bus to play onto: --onto vcan0")
+            raise OutsideError("--speed, --interface and --bitrate need the bus to play onto: --bus vcan0")
         return
     if len(paths) > 1 and not args.merge:
         raise OutsideError(f"{len(paths)} recordings can't be played at once; give one, or --merge if they are of one drive")
     if len(args.onto) > 1 and not all(name for name, _ in args.onto):
-        raise OutsideError("several buses: say which channel goes where, --onto can0=vcan0 --onto can1=vcan1")
+        raise OutsideError("several buses: say which channel goes where, --bus can0=vcan0 --bus can1=vcan1")
 
 
 def _run_onto(paths: Sequence[str], task: _Task, args: Namespace) -> int:
@@ -375,12 +378,15 @@ def _events_file(path: str | None, stack: ExitStack) -> BinaryIO | None:
     return stack.enter_context(open(path, "wb"))
 
 
-def _bus(text: str) -> tuple[str, int]:
-    """`can1=0`. Raises ArgumentTypeError."""
-    name, _, index = text.rpartition("=")
-    if not name or not index.isdigit():
-        raise ArgumentTypeError(f'"{text}" is not of the form NAME=INDEX, such as can1=0')
-    return name, int(index)
+def _bus(text: str) -> tuple[str, int | str]:
+    """`can1=0`, a channel's bus; or as `onto.target`. Raises ArgumentTypeError."""
+    name, _, place = text.rpartition("=")
+    if name and place.isdigit():
+        return name, int(place)
+    try:
+        return onto.target(text)
+    except ArgumentTypeError:
+        raise ArgumentTypeError(f'"{text}" is neither NAME=INDEX, such as can1=0, nor an interface, such as vcan0') from None
 
 
 def _bus_names(unit: config.Config) -> dict[str, int]:

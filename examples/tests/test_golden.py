@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import gzip
-import json
 
 import pytest
 
@@ -10,11 +9,12 @@ from examples.golden import (
     DECLARE,
     EXAMPLES,
     SHARED,
-    SUMMARY,
     Example,
+    Recorded,
     Summary,
     changed,
     changed_summary,
+    declared_summary,
     real_recordings,
     summary,
 )
@@ -33,9 +33,11 @@ def test_an_example_gives_the_declared_events(example: Example) -> None:
 def test_real_recordings_give_the_declared_alarms() -> None:
     if not SHARED.is_dir():
         pytest.skip("the shared recordings are not on this machine")
-    declared, present = json.loads(SUMMARY.read_text()), real_recordings()
-    difference = changed_summary(declared, summary(SHARED, declared.keys() & set(present)), present)
+    declared, present = declared_summary(), real_recordings()
+    now = summary(SHARED, present)
+    difference = changed_summary(declared, now, present)
     assert not difference, difference
+    assert not now.keys() - declared.keys(), f"not declared: {now.keys() - declared.keys()}; {DECLARE}"
 
 
 def test_a_change_is_told_by_its_events_and_how_to_declare_it() -> None:
@@ -51,11 +53,16 @@ def test_a_change_is_told_by_its_events_and_how_to_declare_it() -> None:
 
 
 def test_changed_counts_are_told_by_recording_and_alarm() -> None:
-    declared: Summary = {"a.log": {"X": [1, 0]}, "b.log": {}, "absent.log": {}}
-    told = changed_summary(declared, {"a.log": {"X": [2, 1]}}, ["a.log", "b.log", "new.log"])
-    assert told.splitlines()[1:-1] == ["a.log: X: 1 raised, 0 standing at the end → 2 raised, 1 standing at the end",
-                                       "b.log: can no longer be read"]
-    assert changed_summary({"a.log": {}}, {"a.log": {}}, ["a.log"]) == ""
+    once = Recorded(9, "0a", {"X": [1, 0]})
+    declared: Summary = {"a.log": once, "b.log": Recorded(9, "", {}), "c.log": once, "d.log": once, "absent.log": once}
+    now: Summary = {"a.log": Recorded(9, "0b", {"X": [2, 1]}), "c.log": once._replace(events="0c"),
+                    "d.log": once._replace(frames=8)}
+    told = changed_summary(declared, now, ["a.log", "b.log", "c.log", "d.log", "new.log"])
+    assert told.splitlines()[1:-1] == [
+        "a.log: X: 1 raised, 0 standing at the end → 2 raised, 1 standing at the end", "b.log: can no longer be read",
+        "c.log: the same alarms, as often, but their events are others: `ucs replay --events` shows them",
+        "d.log: 9 frames → 8"]
+    assert changed_summary({"a.log": once}, {"a.log": once}, ["a.log"]) == ""
 
 
 def test_the_examples_show_every_step_in_the_life_of_an_alarm_and_stay_small() -> None:

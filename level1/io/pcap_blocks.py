@@ -20,8 +20,8 @@ from level1.io.rows import HEAD_MASKS, block_of_words, on_buses
 
 SOCKETCAN = 227
 """Link type of CAN frames."""
-BATCH_BYTES = 1 << 20
-"""Bytes taken apart at a time."""
+BATCH_BYTES = 1 << 21
+"""Bytes taken apart at a time: some 60,000 frames, so that what a block costs does not matter."""
 MOST_BYTES = 1 << 20
 """A packet or block longer than this is damage."""
 
@@ -32,17 +32,19 @@ _SECTION, _INTERFACE, _PACKET, _SIMPLE = 0x0A0D0D0A, 1, 6, 3
 """Types of pcapng blocks."""
 _NAME, _RESOLUTION = 2, 9
 """Options of an interface."""
-_HEAD, _ROOM = 8, 72
+_HEAD, _ROOM, _PACKET_HEAD = 8, 72, 16
 _XL = 0x80
 """Flag, where other frames have their length, of a CAN XL frame."""
 
-class Packet(NamedTuple):
-    """Where a packet's bytes begin in a batch, how many there are, when it came, on which channel (negative: no CAN bus)."""
 
-    place: int
-    size: int
-    t_ns: int
-    channel: int
+class Packets(NamedTuple):
+    """Of each packet where its bytes begin in a batch, how many there are, when it came (-1: out of range), on which channel
+    (negative: no CAN bus)."""
+
+    places: Ints
+    sizes: Ints
+    t_ns: Ints
+    channels: Ints
 
 
 class Interface(NamedTuple):
@@ -82,7 +84,7 @@ class PcapBlocks:
             walk, tail = self._walk_blocks, magic
         yield from on_buses(self._batches(walk, tail, rows), lambda channel: self._bus(self._names[channel]))
 
-    def _batches(self, walk: Callable[[bytes], tuple[list[Packet], int]], tail: bytes, rows: int) -> Iterator[Block]:
+    def _batches(self, walk: Callable[[bytes], tuple[Packets, int]], tail: bytes, rows: int) -> Iterator[Block]:
         while piece := self._file.read(min(BATCH_BYTES, rows * 32)):
             data = tail + piece
             packets, end = walk(data)
@@ -95,23 +97,26 @@ class PcapBlocks:
 
     # --- where packets are ------------------------------------------------------------------------------------------------
 
-    def _walk(self, data: bytes) -> tuple[list[Packet], int]:
+    def _walk(self, data: bytes) -> tuple[Packets, int]:
         """The whole packets of a piece of a pcap file, and where they end."""
-        packets, place = [], 0
-        unpack, unit_ns, channel = struct.Struct(self._order + "LLL").unpack_from, self._unit_ns, self._interfaces[0].channel
-        while place + 16 <= len(data):
-            seconds, fraction, size = unpack(data, place)
-            if size > MOST_BYTES:
-                raise EOFError(f"a packet of {size} bytes")
-            if place + 16 + size > len(data):
-                break
-            packets.append(Packet(place + 16, size, seconds * 10**9 + fraction * unit_ns, channel))
-            place += 16 + size
-        return packets, place
+        size_at, last, place, found = struct.Struct(self._order + "L").unpack_from, len(data) - _PACKET_HEAD, 0, []
+        while place <= last:
+            found.append(place)
+            place += _PACKET_HEAD + size_at(data, place + 8)[0]
+        places = np.array(found, np.int64)
+        heads = _rows(np.frombuffer(data, np.uint8), places, 12).view(self._order + "u4").astype(np.int64)
+        sizes = heads[:, 2]
+        if len(sizes) and sizes.max() > MOST_BYTES:
+            raise EOFError(f"a packet of {sizes.max()} bytes")
+        if place > len(data):
+            place, places, heads, sizes = found[-1], places[:-1], heads[:-1], sizes[:-1]
+        t_ns = heads[:, 0] * 10**9 + heads[:, 1] * self._unit_ns
+        return Packets(places + _PACKET_HEAD, sizes, t_ns, np.full(len(places), self._interfaces[0].channel)), place
 
-    def _walk_blocks(self, data: bytes) -> tuple[list[Packet], int]:
+    def _walk_blocks(self, data: bytes) -> tuple[Packets, int]:
         """The whole packets of a piece of a pcapng file, and where its whole blocks end."""
-        packets, place = [], 0
+        packets: list[tuple[int, int, int, int]] = []
+        place = 0
         while place + 12 <= len(data):
             kind, size = struct.unpack_from(self._order + "LL", data, place)
             if kind == _SECTION:
@@ -129,16 +134,18 @@ class PcapBlocks:
             elif kind == _PACKET and len(body) >= 20:
                 packets.append(self._packet(body, place + 28))
             elif kind == _SIMPLE:
-                packets.append(Packet(place, 0, 0, -1))
+                packets.append((place, 0, 0, -1))
             place += size
-        return packets, place
+        columns = np.array(packets, np.int64).reshape(-1, 4)
+        return Packets(*columns.T), place
 
-    def _packet(self, body: bytes, place: int) -> Packet:
+    def _packet(self, body: bytes, place: int) -> tuple[int, int, int, int]:
         number, high, low, size = struct.unpack_from(self._order + "LLLL", body)
         if number >= len(self._interfaces):
-            return Packet(place, 0, 0, -1)
+            return place, 0, 0, -1
         interface = self._interfaces[number]
-        return Packet(place, min(size, len(body) - 20), (high << 32 | low) * 10**9 // interface.units, interface.channel)
+        t_ns = (high << 32 | low) * 10**9 // interface.units
+        return place, min(size, len(body) - 20), t_ns if t_ns <= LATEST_NS else -1, interface.channel
 
     def _interface(self, body: bytes) -> Interface:
         """An interface: its link, its name and its resolution of time."""
@@ -160,13 +167,12 @@ class PcapBlocks:
 
     # --- what is in them --------------------------------------------------------------------------------------------------
 
-    def _frames(self, data: bytes, packets: list[Packet]) -> Block | None:
+    def _frames(self, data: bytes, packets: Packets) -> Block | None:
         """The frames of some packets."""
-        if not packets:
+        places, sizes, t_ns, channels = packets
+        if not len(places):
             return None
         room = np.frombuffer(data + bytes(_HEAD + _ROOM), np.uint8)
-        places, sizes, channels = (np.array([packet[column] for packet in packets]) for column in (0, 1, 3))
-        t_ns = np.array([packet.t_ns if packet.t_ns <= LATEST_NS else -1 for packet in packets])
         heads = _rows(room, places, _HEAD)
         ids = heads[:, :4].copy().view(">u4")[:, 0].astype(np.uint64)
         lengths = heads[:, 4].astype(np.int64)
@@ -176,8 +182,10 @@ class PcapBlocks:
         lengths[is_remote & ~is_error] = 0
         right &= sizes >= _HEAD + lengths
         for place in np.flatnonzero(~right).tolist():
-            self._skip(f"unreadable packet {self._count + place + 1}: {self._reason(packets[place], int(lengths[place]))}")
-        self._count += len(packets)
+            reason = "no CAN frame" if channels[place] < 0 else "time stamp out of range" if t_ns[place] < 0 else (
+                f"{lengths[place]} data bytes in a packet of {sizes[place]}")
+            self._skip(f"unreadable packet {self._count + place + 1}: {reason}")
+        self._count += len(places)
         keep = np.flatnonzero(right)
         if not len(keep):
             return None
@@ -189,14 +197,6 @@ class PcapBlocks:
         wide = _rows(room, places[wide_rows], _ROOM)
         wide[np.arange(_ROOM) >= lengths[wide_rows, None]] = 0
         return block_of_words(t_ns[keep], words, lengths.astype(np.uint16), eight, wide_rows, wide)
-
-    @staticmethod
-    def _reason(packet: Packet, length: int) -> str:
-        if packet.channel < 0:
-            return "no CAN frame"
-        if packet.t_ns > LATEST_NS:
-            return "time stamp out of range"
-        return f"{length} data bytes in a packet of {packet.size}"
 
 
 def _rows(room: npt.NDArray[np.uint8], places: Ints, width: int) -> npt.NDArray[np.uint8]:

@@ -129,9 +129,10 @@ def test_a_recording_arrives_on_a_bus_whole_and_in_order(replay: Run, log: Path)
     assert err == f"ucs: {log}: 1 error frame, 0 remote frames\n"
 
 
-def test_channels_go_where_they_are_sent(replay: Run, log: Path) -> None:
+@pytest.mark.parametrize("option", ["--onto", "--bus"])
+def test_channels_go_where_they_are_sent(replay: Run, log: Path, option: str) -> None:
     with can.Bus(interface="virtual", channel="a") as bus:
-        code, _, _ = replay(log, "--onto", "can1=a", "--interface", "virtual", "--speed", 100)
+        code, _, _ = replay(log, option, "can1=a", "--interface", "virtual", "--speed", 100)
         heard = [message.arbitration_id for _ in range(10) if (message := bus.recv(0))]
         assert code == 0 and heard == list(range(0x101, 0x114, 2)) and bus.recv(0) is None
 
@@ -143,14 +144,20 @@ def test_definitions_supervise_what_is_played(replay: Run, tmp_path: Path, log: 
 
 
 @pytest.mark.parametrize(("words", "told"), [
-    (("--speed", "1"), "ucs: --speed, --interface and --bitrate need the bus to play onto: --onto vcan0\n"),
+    (("--speed", "1"), "ucs: --speed, --interface and --bitrate need the bus to play onto: --bus vcan0\n"),
     (("--onto", "vcan0", "--onto", "vcan1"),
-     "ucs: several buses: say which channel goes where, --onto can0=vcan0 --onto can1=vcan1\n"),
+     "ucs: several buses: say which channel goes where, --bus can0=vcan0 --bus can1=vcan1\n"),
     (("--onto", "a", "--interface", "virtul"), 'ucs: no interface is called "virtul"; did you mean "virtual"?\n'),
 ])
 def test_what_does_not_fit_together_is_one_line(replay: Run, log: Path, words: tuple[str, ...], told: str) -> None:
     dbc = () if "--onto" in words else ("--dbc", "flaming_tool.dbc")
     assert replay(log, *words, *dbc) == (2, "", told)
+
+
+def test_a_bus_is_a_channel_with_its_number_or_an_interface(replay: Run, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        replay(log, "--bus", "=3")
+    assert '"=3" is neither NAME=INDEX, such as can1=0, nor an interface, such as vcan0' in capsys.readouterr().err
 
 
 def test_two_recordings_need_merge(replay: Run, log: Path, tmp_path: Path) -> None:
