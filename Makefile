@@ -66,6 +66,7 @@ packages-vcan:
 
 # Made anew only when pyproject.toml changes: the packages themselves are used in place.
 $(VENV)/ready: pyproject.toml | packages
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --editable '.[test]'
+	@echo "Setting up $(VENV), once: it takes a minute or two."
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --editable '.[test]'
 	@touch $@

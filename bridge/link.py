@@ -7,7 +7,7 @@ makes a `RunLink`, the bridge a `BridgeLink`; either may start first, end, and s
                    Samples    the latest monitoring messages; also the sign that supervision is alive
                    Beside     events that the journal can't take now (`Journal.pending`): they leave all the same
                    Answer     the result of an order
-    bridge → run   Instruct   an order that passed the gate
+    bridge → run   Instruct   an order that passed the gate; at a socket of its own, from someone at the machine
                    Refusal    somebody commanded who may not: supervision makes an alarm of it
 """
 from __future__ import annotations
@@ -187,6 +187,36 @@ class BridgeLink(_End[FromRun]):
     def refuse(self, reason: str, key: str, count: int) -> bool:
         """Tell that commands were refused."""
         return self._send(Refusal(reason, key, count))
+
+
+class LocalEnd(_End[Instruct]):
+    """Where `ucs run` hears someone at the machine: a socket of its own, which a bridge need not reach. Raises OSError."""
+
+    def __init__(self, journal: Path):
+        super().__init__(journal, "local", "order", msgspec.json.Decoder(Instruct))
+
+    def receive(self) -> list[Instruct]:
+        """The orders that came."""
+        return self._receive()
+
+    def answer(self, result: Result) -> bool:
+        """Hand over the result of an order; nobody may wait for it."""
+        return self._send(Answer(result))
+
+
+class OrderEnd(_End[Answer]):
+    """The end of someone at the machine. Raises OSError where the folder can't be written."""
+
+    def __init__(self, journal: Path):
+        super().__init__(journal, "order", "local", msgspec.json.Decoder(Answer))
+
+    def instruct(self, order: Order) -> bool:
+        """Hand over an order; False when `ucs run` isn't there."""
+        return self._send(Instruct(order))
+
+    def receive(self) -> list[Answer]:
+        """The results that came."""
+        return self._receive()
 
 
 def _name(journal: Path, end: str) -> str:

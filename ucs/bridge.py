@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     if args.make_site:
         return _make_site(args)
     if args.unit is None:
-        raise ConfigError("ucs bridge: give the path of a unit.toml")
+        raise ConfigError("give the path of a unit.toml (see ucs bridge --help)")
     from bridge.session import Bridge
     settings = settings_of(load(args.unit))
     service = Supervised()

@@ -113,7 +113,8 @@ def _handbook(catalog: Catalog, out: Path) -> int:
         out.write_text(makers[out.suffix](catalog), encoding="utf-8")
     except OSError as error:
         raise OutsideError(f"{out}: can't be written: {error.strerror}") from error
-    print(f"{out}: handbook of {len(catalog.alarms)} alarms")
+    count = len(catalog.alarms)
+    print(f"{out}: handbook of {count} alarm{'s' * (count != 1)}")
     return 0
 
 

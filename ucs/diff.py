@@ -138,7 +138,7 @@ def _run_sweep(args: Namespace, catalog: Catalog, paths: Sequence[str]) -> int:
         print(msgspec.json.encode({"alarm": sweep.alarm, "attribute": sweep.attribute, "hours": hours, "values": [
             {"value": value, **_behaviour_object(found)} for value, found in rows]}).decode())
     else:
-        print(f"{sweep.alarm} over {len(recorded)} recordings, {hours:.2f} h")
+        print(f"{sweep.alarm} over {_recordings(len(recorded))}, {hours:.2f} h")
         print(*aligned([(sweep.attribute, "raised", "per hour", "standing", "chattered", "locked out"), *(
             (value, str(found.raised), f"{found.per_hour:.2f}", f"{found.standing_s:.1f} s", str(found.chatter),
              str(found.locked_out)) for value, found in rows)]), sep="\n")
@@ -208,7 +208,7 @@ def _replaced(node: Expression, number: Number) -> Expression:
 
 def _print(compared: Comparison) -> None:
     colour = wants_colour(sys.stdout)
-    print(f"{len(compared.recorded)} recordings, {compared.hours:.2f} h")
+    print(f"{_recordings(len(compared.recorded))}, {compared.hours:.2f} h")
     rows = [("alarm", "old", "new", "per hour", "standing", "chattered", "first")]
     for alarm in compared.alarms():
         old, new = (compared.behaviour(side, alarm) for side in (compared.old, compared.new))
@@ -279,3 +279,7 @@ def _duration_s(text: str) -> float:
         return config.duration_ns(text) / 1e9
     except ValueError as error:
         raise ArgumentTypeError(str(error)) from None
+
+
+def _recordings(count: int) -> str:
+    return f"{count} recording{'s' * (count != 1)}"

@@ -42,6 +42,7 @@ GROUPS = {
         "monitor": Command("ucs.monitor", "watch alarms, repairs, signals and buses live in the terminal"),
         "status": Command("ucs.status", "how a unit is, once: for people and monitoring systems"),
         "journal": Command("ucs.journal", "list, follow and export what happened"),
+        "order": Command("ucs.order", "acknowledge, reset a lock-out, resume: as someone at the machine"),
         "bridge": Command("ucs.bridge", "carry a unit's events to level 2 and commands back"),
     },
     "above the tractor": {
@@ -53,9 +54,10 @@ COMMANDS = {name: command for group in GROUPS.values() for name, command in grou
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that tells a mistake in one line. mistake: the exit code of one."""
+    """A parser that tells a mistake in one line. mistake: the exit code of one. chosen: the parser of the chosen subcommand."""
 
     mistake = 2
+    chosen: argparse.ArgumentParser | None = None
 
     def error(self, message: str) -> NoReturn:
         print(f"ucs: {message} (see {self.prog} --help)", file=sys.stderr)
@@ -74,7 +76,7 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def build_parser(chosen: str | None) -> argparse.ArgumentParser:
+def build_parser(chosen: str | None) -> _Parser:
     """The command line, with the arguments of the chosen subcommand; the others stand there by name and help only."""
     parser = _Parser(
         prog="ucs", description="Supervision of a tractor and its implements: alarms, repairs, and the way to level 2.",
@@ -85,6 +87,7 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
     for name, command in COMMANDS.items():
         if name == chosen:
             importlib.import_module(command.module).add_parser(commands)
+            parser.chosen = commands.choices[name]
         elif command.module != loaded:
             commands.add_parser(name, add_help=False)
     return parser
@@ -123,7 +126,9 @@ def _run(words: list[str]) -> int:
     if not words:
         parser.print_help(sys.stderr)
         return 2
-    args = parser.parse_args(words)
+    args, unknown = parser.parse_known_args(words)
+    if unknown:
+        (parser.chosen or parser).error(f"unrecognized arguments: {' '.join(unknown)}")
     try:
         code: int = importlib.import_module(COMMANDS[args.command].module).run(args)
         return code

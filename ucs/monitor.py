@@ -207,7 +207,7 @@ class Recording:
         self._fill()
         self._begun_ns = time.monotonic_ns()
         self._paused_ns: int | None = None
-        self._received = 0
+        self._received, self._last_ns = 0, self._log.first_ns
 
     @property
     def names(self) -> Sequence[str]:
@@ -229,11 +229,13 @@ class Recording:
             if not self._waiting:
                 self._fill()
         self._received += len(found)
+        self._last_ns = found[-1].t_ns if found else self._last_ns
         return found
 
     def buses(self) -> list[BusStanding]:
         """All channels of the recording as one."""
-        return [BusStanding(self._log.path.name, "recording", "", "BusActive", self._received, 0)]
+        quiet_s = max(0, self.now_ns() - self._last_ns) / 1e9
+        return [BusStanding(self._log.path.name, "recording", "", "BusActive", self._received, 0, quiet_s)]
 
     def notes(self) -> list[str]:
         """See `Source`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -36,12 +36,35 @@ PLAUSIBLE_S = 1_700_000_000
 """A wall clock before this (November 2023) has never been set."""
 
 
+DESCRIPTION = """\
+Supervise a unit live: read its buses, raise alarms, repair what is armed, write the journal. A line for each event as it
+happens. Ends by SIGTERM or Ctrl-C with exit code 0.
+"""
+EPILOG = """\
+A unit.toml, to begin with:
+
+  [unit]
+  name = "tractor-7"
+  [[bus]]
+  name = "implement"
+  channel = "can0"                        # SocketCAN; another interface of python-can: interface = "udp_multicast"
+  dbc = ["ucs.dbc", "flaming_tool.dbc"]   # shipped files by name, your own by path
+  [repairs]
+  armed = []                              # alarms whose repair may act; the others only tell what they would send
+  [journal]
+  path = "journal.db"
+
+Beside it: `ucs monitor unit.toml` shows it live, `ucs status unit.toml` tells whether all is well, `ucs journal unit.toml`
+what happened, `ucs bridge unit.toml` carries it to level 2. docs/operation.md tells how to run it as a service.
+"""
+
+
 def add_parser(commands: Any) -> None:
     """The arguments of `ucs run`."""
     parser: ArgumentParser = commands.add_parser(
         "run", help="supervise a unit live",
-        description="Supervise a unit live: read its buses, raise alarms, repair what is armed, write the journal. A line for "
-                    "each event as it happens. Ends by SIGTERM or Ctrl-C with exit code 0.")
+        description=DESCRIPTION,
+        epilog=EPILOG, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("unit", metavar="unit.toml", help="the unit's configuration")
     parser.add_argument("--check", action="store_true", help="only check the configuration and its definitions")
 

@@ -31,13 +31,26 @@ PATIENCE = "10 s"
 PYTHON_CAN_DEFAULT = "socketcan"
 
 
+DESCRIPTION = """\
+Runs the nodes of a scenario and tells what happens. Without a bus in virtual time, faster than real; with --bus, or --interface
+and --channel, in real time on that bus.
+"""
+EPILOG = """\
+A name that is no file is looked up among the shipped scenarios; --list shows them, and what scenarios can say.
+
+  ucs simulate healthy.toml                            ten minutes of work in a moment
+  ucs simulate windy.toml --supervise --plot windy.png level 1 beside the nodes, and a picture of it
+  ucs simulate windy.toml --bus vcan0                  in real time, for a `ucs run` on that bus
+  ucs simulate windy.toml --interface udp_multicast --channel 239.74.163.2    the same without any CAN hardware
+"""
+
+
 def add_parser(subparsers: Any) -> None:
     """The arguments of `ucs simulate`."""
     parser = subparsers.add_parser(
         "simulate", help="simulate the nodes on the bus, with faults as a scenario says",
-        description="Runs the nodes of a scenario and tells what happens. Without a bus in virtual time, faster than real; "
-                    "with --bus, or --interface and --channel, in real time on that bus.",
-        epilog="A name that is no file is looked up among the shipped scenarios; --list shows them, and what scenarios can say.")
+        description=DESCRIPTION,
+        epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO.toml", help="the scenario to run")
     parser.add_argument("--list", action="store_true", help="show the shipped scenarios, programs, settings, orders and faults")
     parser.add_argument("--bus", metavar="NAME", help="SocketCAN interface, such as vcan0")

@@ -7,8 +7,10 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import msgspec
+
 from bridge.delivered import delivered_path, delivered_upto
-from bridge.link import Refusal, RunLink
+from bridge.link import LocalEnd, Refusal, RunLink
 from level1.bus_health import Report
 from level1.event import Event, Monitor, Result
 from level1.io.inbox import Inbox
@@ -26,10 +28,14 @@ PRUNE_S = 60.0
 
 
 class Uplink:
-    """A context manager. publish is called by the live loop, which alone shows that supervision is alive."""
+    """A context manager. publish is called by the live loop, which alone shows that supervision is alive.
+
+    Orders come at two sockets: from above through the bridge, and from someone at the machine (`ucs order`).
+    """
 
     def __init__(self, journal: Journal, inbox: Inbox, clock: Callable[[], int]):
         self._link = RunLink(Path(journal.path))
+        self._local = LocalEnd(Path(journal.path))
         self._journal, self._inbox, self._clock = journal, inbox, clock
         self._alive_due_ns = self._beside_due_ns = 0
         self._wake, self._awake = os.pipe()
@@ -43,6 +49,7 @@ class Uplink:
         os.write(self._awake, b".")
         self._thread.join()
         self._link.close()
+        self._local.close()
         os.close(self._wake)
         os.close(self._awake)
 
@@ -54,6 +61,7 @@ class Uplink:
         for output in outputs:
             if isinstance(output, Result):
                 self._link.answer(output)
+                self._local.answer(output)
         monitors = [output for output in outputs if isinstance(output, Monitor)]
         if monitors or now_ns >= self._alive_due_ns:
             self._alive_due_ns = now_ns + ALIVE_NS
@@ -65,11 +73,14 @@ class Uplink:
     def _listen(self) -> None:
         """Orders, until the end; and now and then what level 2 has acknowledged."""
         while True:
-            readable, _, _ = select.select([self._link.fileno(), self._wake], [], [], PRUNE_S)
+            readable, _, _ = select.select([self._link.fileno(), self._local.fileno(), self._wake], [], [], PRUNE_S)
             if self._wake in readable:
                 return
+            # where an order came in says who gave it, whatever it says itself
             for instruct in self._link.receive():
-                self._inbox.order(instruct.order)
+                self._inbox.order(msgspec.structs.replace(instruct.order, origin="above"))
+            for instruct in self._local.receive():
+                self._inbox.order(msgspec.structs.replace(instruct.order, origin="local"))
             while self._link.refusals:
                 self._inbox.report(_refused(self._link.refusals.popleft(), self._clock()))
             if not readable:

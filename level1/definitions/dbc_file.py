@@ -239,7 +239,8 @@ class _Reader:
         found = re.match(r"\w+|.?", lines[line - 1][column - 1:column + 40])
         token = found.group() if found else ""
         what = f"`{token}` in column {column}" if token else f"column {column}"
-        return line, f"not a valid DBC file: {what} is not expected here", "the statement may have begun on a line before"
+        return line, f"not a valid DBC file: {what} is not expected here", ("the statement may have "
+                "begun on a line before, or the `;` that ends the one before is missing")
 
     def _value_error(self, text: str) -> tuple[int, str, str]:
         literal = re.match(r"invalid literal for int\(\) with base \d+: '(.*)'$", text)
@@ -343,14 +344,16 @@ class _Reader:
         return 0
 
     def _find_overlaps(self, message: DbcMessage, text: MessageText, signals: tuple[Signal, ...]) -> None:
-        """Overlapping signals are no error: real files do that on purpose for variants of a message."""
+        """Overlapping signals are an error only where the UCS sends them: real files do it on purpose for variants of a message."""
         plain = [(signal, line.line) for signal, line in zip(signals, text.signals, strict=True)
                  if signal.multiplexer_ids is None and 0 < signal.length <= 8 * message.length]
         owners: dict[int, str] = {}
         for signal, line in plain:
             taken = next((owners[bit] for bit in _bits(signal) if bit in owners), None)
             if taken:
-                self._problem(line, f"overlaps {taken}", where=f"{message.name}.{signal.name}", severity="warning")
+                ours = "UCS" in message.senders
+                self._problem(line, f"overlaps {taken}", "the UCS sends both: move one to free bits" if ours else "",
+                              where=f"{message.name}.{signal.name}", severity="error" if ours else "warning")
             else:
                 owners.update(dict.fromkeys(_bits(signal), signal.name))
 

@@ -512,6 +512,7 @@ def test_long_names_stand_in_for_short_ones() -> None:
     ("40|12@1+", "60|12@1+", "error", "doesn't fit"),
     ("7|8@0+", "7|8@0+", "", ""),
     ("40|12@1+", "3|12@0+", "warning", "overlaps"),
+    ("SG_ SpeedLimit : 8|", "SG_ SpeedLimit : 1|", "error", "overlaps"),
     ("32|32@1- (1,0) [0|0] \"\" UCS\nBO_ 272", "32|31@1- (1,0) [0|0] \"\" UCS\nBO_ 272", "error", "can't have 31 bits"),
     ("[-20|100]", "[100|-20]", "warning", "wrong way round"),
     ("SG_ Mask", "SG_ Flow", "error", "used twice in its message"),

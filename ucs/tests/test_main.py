@@ -80,7 +80,7 @@ def test_a_wrong_argument_is_one_line(given: Any, capsys: pytest.CaptureFixture[
     with pytest.raises(SystemExit) as ended:
         command.main(["given", "--speed"])
     assert ended.value.code == 2
-    assert capsys.readouterr().err == "ucs: unrecognized arguments: --speed (see ucs --help)\n"
+    assert capsys.readouterr().err == "ucs: unrecognized arguments: --speed (see ucs given --help)\n"
 
 
 def test_the_exit_code_is_the_commands(given: Any) -> None:
