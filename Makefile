@@ -6,7 +6,7 @@ WHEEL_VENV := .venv-wheel
 PACKAGES := level1 bridge firmware_py dbc level2 ucs
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test check test-wheel golden coverage soak clean packages packages-vcan
+.PHONY: help demo test check test-wheel golden coverage soak season clean packages packages-vcan
 
 help:
 	@echo "make demo        simulated tractor and implements, faults, repairs, level 2: about a minute"
@@ -16,6 +16,7 @@ help:
 	@echo "make golden      declare the events that the examples give now (see examples/README.md)"
 	@echo "make coverage    write docs/coverage.md: which tests prove which line of the specification"
 	@echo "make soak        kills, power cuts and forged commands at length: about ten minutes"
+	@echo "make season      1,000 h of virtual time with random faults: hours; goes on where it was stopped"
 	@echo "make clean       remove what these made"
 
 demo: $(VENV)/ready
@@ -48,6 +49,10 @@ test-wheel: $(VENV)/ready
 # Writes its counts into docs/reliability.md.
 soak: $(VENV)/ready packages-vcan
 	$(BIN)/python -m benchmarks.soak --write
+
+# Writes its counts into docs/reliability.md, too.
+season: $(VENV)/ready
+	$(BIN)/python -m benchmarks.season --write
 
 golden: $(VENV)/ready
 	$(BIN)/python -m examples.golden

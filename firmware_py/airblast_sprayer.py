@@ -96,6 +96,16 @@ class AirblastSprayer(CanopenNode):
         self._state = "Idle"
         self._retries = False
 
+    @property
+    def works(self) -> bool:
+        """Whether it sprays, as its status tells."""
+        return self._mode.position == "On" and self._valve.position == "Open"
+
+    @property
+    def state(self) -> str:
+        """Idle, Working, CommandsLost or TankEmpty."""
+        return self._state
+
     # --- protocol ---------------------------------------------------------------------------------------------------------
 
     def hear(self, t_ns: int, message: str, values: Mapping[str, Value]) -> None:

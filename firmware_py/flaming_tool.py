@@ -148,7 +148,7 @@ class FlamingTool(Node):
         if gas:
             self._gas_wanted_ns = t_ns
         self._follow(t_ns, fresh and t_ns - self._gas_wanted_ns < MODE_END_NS, flame)
-        self.plant.advance(t_ns, opening=self._opening, spark=self._spark, burners=self._burner_positions)
+        self.plant.advance(t_ns, opening=self._opening, spark=self._spark, burners=self.burner_positions)
         seen = self._look()
         if seen != self._told:
             self._tell_changes(t_ns, seen)
@@ -175,7 +175,23 @@ class FlamingTool(Node):
         return self.powered and self.safeguard.sparks and self._command["Igniter"] == "On" and not self._igniter_dead
 
     @property
-    def _burner_positions(self) -> tuple[str, ...]:
+    def works(self) -> bool:
+        """Whether it is in its work mode."""
+        return self._mode.position == "On"
+
+    @property
+    def valve(self) -> str:
+        """Where the gas valve stands: Open or Closed."""
+        return self._valve.position
+
+    @property
+    def sees_flame(self) -> bool:
+        """What the flame sensor says."""
+        return self._sensor.sees
+
+    @property
+    def burner_positions(self) -> tuple[str, ...]:
+        """Off, Low or High, of each burner."""
         return tuple([burner.position for burner in self._burners])
 
     def values(self, message: str) -> Mapping[str, Value]:
@@ -256,7 +272,7 @@ class FlamingTool(Node):
     def _look(self) -> tuple[object, ...]:
         """What a bystander sees; in the order of `_tell_changes`."""
         return (self._valve.position, self._spark, self.plant.flame, self.safeguard.state, self._mode.position,
-                self._burner_positions, len(self.plant.hazards))
+                self.burner_positions, len(self.plant.hazards))
 
     def _tell_changes(self, t_ns: int, seen: tuple[object, ...]) -> None:
         valve, spark, flame, state, mode, burners, hazards = zip(self._told, seen, strict=True)
@@ -272,7 +288,7 @@ class FlamingTool(Node):
         if mode[0] != mode[1]:
             self.tell(t_ns, f"flaming {str(mode[1]).lower()}")
         if burners[0] != burners[1]:
-            self.tell(t_ns, f"burners {' '.join(self._burner_positions).lower()}")
+            self.tell(t_ns, f"burners {' '.join(self.burner_positions).lower()}")
         for hazard in self.plant.hazards[self._told_hazards:]:
             self.tell(t_ns, f"HAZARD: {hazard.what}")
         self._told_hazards = len(self.plant.hazards)

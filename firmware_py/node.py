@@ -124,6 +124,16 @@ class Node:
         happenings, self._happenings = self._happenings, []
         return happenings
 
+    @property
+    def sends(self) -> bool:
+        """Whether anything leaves it."""
+        return self.powered and not self._silent
+
+    @property
+    def talks(self) -> bool:
+        """Whether what leaves it is what it knows: not silent, not frozen, not off."""
+        return self.powered and not self._silent and not self._frozen
+
     # --- faults -----------------------------------------------------------------------------------------------------------
 
     def inject(self, now_ns: int, statement: Statement) -> None:

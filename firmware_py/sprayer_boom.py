@@ -141,6 +141,11 @@ class SprayerBoom(Node):
         return self._mode.position == "On"
 
     @property
+    def set_points(self) -> tuple[float, float]:
+        """Taken over: main flow in L/min, herbicide in mL/min, for all sections open."""
+        return self._main_set.position, self._dis_set.position
+
+    @property
     def control(self) -> str:
         """Who is in command: Remote, Manual or CommandsLost."""
         return "Manual" if self._manual else "CommandsLost" if self._lost else "Remote"

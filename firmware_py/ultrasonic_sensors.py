@@ -119,6 +119,11 @@ class UltrasonicSensors(CanopenNode):
         self._told = [sensor.state for sensor in self._sensors]
 
     @property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """All of them, 1 first."""
+        return self._sensors
+
+    @property
     def states(self) -> tuple[str, ...]:
         """What each sensor is doing."""
         return tuple(sensor.state for sensor in self._sensors)

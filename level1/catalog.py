@@ -100,7 +100,8 @@ class Repair(msgspec.Struct, frozen=True):
     moves: it moves something, so it is inhibited while the unit is stopped or paused from above (attribute RepairMoves,
     default Yes). safe_between: a failed attempt enters the safe state at once; else (attribute RepairBetween, AsCommanded)
     its messages return to what was commanded before the episode, and each attempt begins from there. local_reset: a lock-
-    out can only be reset on board (attribute RepairReset, default Local).
+    out can only be reset on board (attribute RepairReset, default Local). counts_good: attempts that were good use up the budget,
+    too (attribute RepairCounts, default All).
     """
 
     steps: tuple[Step, ...]
@@ -111,6 +112,7 @@ class Repair(msgspec.Struct, frozen=True):
     moves: bool = True
     local_reset: bool = True
     safe_between: bool = True
+    counts_good: bool = True
     text: str = ""
     give_up_text: str = ""
 

@@ -7,7 +7,8 @@ attempt enters the safe state (the sends of RepairGiveUp) immediately**, before 
 must not leave the valve open while the next one is awaited. Only where the definition says that trying again is harmless
 (RepairBetween AsCommanded) do its messages return to what was commanded before the episode instead, and each attempt begins
 from that. When as many attempts as the budget allows have begun within its window, the next failure, or the next
-activation, locks the alarm out: safe state, held until a reset on board.
+activation, locks the alarm out: safe state, held until a reset on board. Where the definition says so (RepairCounts Failed), an
+attempt that was good is given back to the budget when its alarm clears: what wind does again and again is reported, not locked.
 
 From the first attempt to the end of the episode the repair owns its command messages: it repeats them at their cycle time,
 and the alarm signal on the bus reads Repairing, upon which other programs stop sending them. One message serves one repair at a
@@ -52,11 +53,12 @@ class RepairMachine:
     """The repair of one alarm at run time. phase: IDLE, RUNNING (a step waits), PAUSING (between attempts), WAITING (may not act),
     SETTLING (the condition is back after a repair, before the alarm has cleared: it must hold for the on-delay again).
 
-    begun_ns: when the attempts within the window began. attempt: number of the present or last attempt of this activation.
+    begun_ns: when the attempts within the window began; good_ns: those of them in this activation that were good. attempt:
+    number of the present or last attempt of this activation.
     expects: a closure with the verdict for each expect step; feedback(): worst verdict of all of them, unknown or not.
     """
 
-    __slots__ = ("alarm", "attempt", "begun_ns", "definition", "due", "expects", "feedback", "holds", "host", "order",
+    __slots__ = ("alarm", "attempt", "begun_ns", "definition", "due", "expects", "feedback", "good_ns", "holds", "host", "order",
                  "phase", "position", "reported", "timers")
 
     def __init__(self, alarm: AlarmMachine, definition: Repair, host: Host, holds: Holds, timers: Timers,
@@ -74,6 +76,7 @@ class RepairMachine:
         self.position = 0
         self.attempt = 0
         self.begun_ns: list[int] = []
+        self.good_ns: list[int] = []
         self.reported = False
 
     @property
@@ -167,6 +170,9 @@ class RepairMachine:
         self.phase = IDLE
         self.attempt = 0
         self.reported = False
+        if not self.definition.counts_good:
+            self.begun_ns = [begun for begun in self.begun_ns if begun not in self.good_ns]
+        self.good_ns.clear()
         self.holds.release(self, t_ns)
 
     def restore(self, t_ns: int, attempt: int, begun_ns: list[int]) -> None:
@@ -258,6 +264,7 @@ class RepairMachine:
             self.fail(t_ns, "all steps are done, but its condition still holds")
             return
         self.host.emit(self.alarm, t_ns, "repaired", "", self.attempt)
+        self.good_ns.append(self.begun_ns[-1])
         self._end(t_ns)
 
     def _end(self, t_ns: int) -> None:

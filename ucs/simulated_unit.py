@@ -4,6 +4,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from firmware_py.participant import BusFrame
+from level1.command import Order
 from level1.event import Output, Send
 from level1.frame import EXTENDED, Frame
 from level1.supervisor import Supervisor
@@ -22,6 +23,10 @@ class SimulatedUnit:
         outputs = self.supervisor.receive(Frame(t_ns, can_id | EXTENDED if extended else can_id, data))
         if outputs:
             self._take(outputs)
+
+    def command(self, t_ns: int, order: Order) -> None:
+        """An order of somebody at the machine, or from above."""
+        self._take(self.supervisor.command(order, t_ns))
 
     def step(self, now_ns: int) -> list[BusFrame]:
         """Time for the supervisor; gives its frames."""

@@ -114,6 +114,7 @@ def _repair(place: Place, scope: Scope) -> Repair | None:
     return Repair(steps=steps, give_up=give_up, attempts=attempts, window_ns=window * S, pause_ns=pause * MS,
                   moves=moves == "Yes", local_reset=reset == "Local", text=place.text("Repair"),
                   safe_between=place.word("RepairBetween", "SafeState") == "SafeState",
+                  counts_good=place.word("RepairCounts", "All") == "All",
                   give_up_text=place.text("RepairGiveUp"))
 
 

@@ -50,6 +50,7 @@ ATTRIBUTES: Mapping[str, AttributeSpec] = {
     "RepairMoves": AttributeSpec("SG_", ("ENUM",), ("No", "Yes")),
     "RepairReset": AttributeSpec("SG_", ("ENUM",), ("Local", "FromAbove")),
     "RepairBetween": AttributeSpec("SG_", ("ENUM",), ("SafeState", "AsCommanded")),
+    "RepairCounts": AttributeSpec("SG_", ("ENUM",), ("All", "Failed")),
     "Role": AttributeSpec("SG_", ("ENUM",), ("None", "Counter", "Checksum")),
     "ChecksumType": AttributeSpec("SG_", ("ENUM",), tuple(CHECKSUMS)),
     "MonitorAs": AttributeSpec("BO_", ("STRING",)),

@@ -1,0 +1,54 @@
+"""Days of a season, one after the other or in a pool of processes."""
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+
+from benchmarks.season.day import Day, DayResult
+from benchmarks.season.plan import S, plan
+
+Job = tuple[int, int, int, str | None]
+"""Seed, number, length of the day in ns, machine if not drawn."""
+_turns = itertools.count()
+_process = f"{os.getpid()}-{time.time_ns()}"
+
+
+def work(job: Job) -> DayResult:
+    """One day, in whatever process."""
+    seed, number, length_ns, machine = job
+    day = plan(seed, number, length_ns, machine)
+    try:
+        result = Day(day).run()
+    except Exception:
+        lines = traceback.format_exc().strip().splitlines()
+        result = DayResult(number, day.machine, length_ns / 3600 / S, "", wrong=[f"CRASH {' | '.join(lines[-4:])}"])
+    result.process, result.turn = _process, next(_turns)
+    return result
+
+
+def run(jobs: Sequence[Job], processes: int) -> Iterator[DayResult]:
+    """The outcomes, as they come."""
+    if processes == 1:
+        yield from map(work, jobs)
+        return
+    executor = ProcessPoolExecutor(processes, get_context("spawn"), _deaf)
+    try:
+        for future in as_completed([executor.submit(work, job) for job in jobs]):
+            yield future.result()
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        for process in list((executor._processes or {}).values()):
+            process.terminate()
+        raise
+    executor.shutdown()
+
+
+def _deaf() -> None:
+    """Ctrl-C is for the process that ends the others."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
