@@ -76,6 +76,10 @@ class Computer(Node):
         self.cpu_c, self.board_c = self._ambient_c + CPU_LOAD_C, self._ambient_c + BOARD_LOAD_C
         self.ram_percent, self.storage_percent = RAM_PERCENT, STORAGE_PERCENT
 
+    def fails(self, device: str) -> bool:
+        """Whether one of its parts is broken now."""
+        return device in self._faults or bool(self._orders.get(device))
+
     def hear(self, t_ns: int, message: str, values: Mapping[str, Value]) -> None:
         """An order of a repair."""
         if values.get("TrafficLogOrder") == "Reopen":

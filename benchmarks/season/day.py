@@ -79,7 +79,7 @@ def _definitions(programs: tuple[str, ...]) -> tuple[Catalog, Codec]:
     """Shared by all days of one machine in a process; nothing changes them."""
     nodes = [PROGRAMS[program] for program in programs]
     files = tuple(dict.fromkeys(name for node in nodes for name in (node.DBC, *node.MORE_DBC)))
-    return definitions.load(["ucs.dbc", *files]), Codec.shipped(*files)
+    return definitions.load(list(dict.fromkeys(("ucs.dbc", *files)))), Codec.shipped(*files)
 
 
 class _Watched:

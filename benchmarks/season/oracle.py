@@ -408,10 +408,38 @@ AIRBLAST_MISSION: Mapping[str, Row] = {
     "ignores repairs": Row(),
 }
 
+# --- the UCS's own computer -------------------------------------------------------------------------------------------------
+
+
+def _part(alarm: str, within_s: float, device: str) -> Symptom:
+    return _symptom(alarm, within_s, lambda w, n: w.computer.talks and w.computer.fails(device))
+
+
+CPU_HOT = _symptom("CpuTemperatureCritical", 13.0, lambda w, n: w.computer.talks and w.computer.cpu_c > 95)
+BOARD_HOT = _symptom("MainboardTemperatureCritical", 13.0, lambda w, n: w.computer.talks and w.computer.board_c > 83)
+RAM_FULL = _symptom("RamCritical", 33.0, lambda w, n: w.computer.talks and w.computer.ram_percent > 93)
+STORAGE_FULL = _symptom("StorageCritical", 33.0, lambda w, n: w.computer.talks and w.computer.storage_percent > 96)
+NOT_MEASURED = _symptom("HealthNotMeasured", 5.5, lambda w, n: not w.computer.sends)
+
+COMPUTER: Mapping[str, Row] = {
+    "cpu overheats": Row((CPU_HOT,)),
+    "board overheats": Row((BOARD_HOT,)),
+    "memory leaks": Row((RAM_FULL,)),
+    "storage fills": Row((STORAGE_FULL,)),
+    "storage fails": Row((_part("StorageWriteFailed", 4.0, "storage"), _part("JournalFault", 4.0, "storage"))),
+    "recorder fails": Row((_part("TrafficLogFailed", 4.0, "recorder"),)),
+    "clock lost": Row((_part("TimeSyncLost", 122.5, "clock"),)),
+    "loop late": Row((_part("LoopLate", 7.0, "loop"),)),
+    "bus overloaded": Row((_part("BusOverloaded", 12.0, "bus"),)),
+    "silent": Row((NOT_MEASURED,)),
+    "frozen": Row(),
+    "reset": Row(),
+}
+
 TABLE: Mapping[str, Mapping[str, Row]] = {
     "flaming_tool": FLAMER, "mission_controller": FLAMER_MISSION, "sprayer_boom": SPRAYER, "sprayer_mission": SPRAYER_MISSION,
     "vehicle": TRACTOR, "vehicle_mission": VEHICLE_MISSION, "airblast_sprayer": AIRBLAST, "ultrasonic_sensors": ULTRASONIC,
-    "airblast_mission": AIRBLAST_MISSION,
+    "airblast_mission": AIRBLAST_MISSION, "computer": COMPUTER,
 }
 """Program -> fault, as `device action` -> what is known of it."""
 

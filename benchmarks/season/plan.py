@@ -21,10 +21,10 @@ class Machine:
 
 MACHINES: Mapping[str, Machine] = {
     "flaming tool": Machine({"flamer": "flaming_tool", "mission": "mission_controller"}, 25),
-    "sprayer boom": Machine({"sprayer": "sprayer_boom", "mission": "sprayer_mission"}, 20),
+    "sprayer boom": Machine({"sprayer": "sprayer_boom", "mission": "sprayer_mission", "computer": "computer"}, 20),
     "tractor with boom": Machine({"tractor": "vehicle", "driver": "vehicle_mission", "sprayer": "sprayer_boom",
                                   "mission": "sprayer_mission"}, 20),
-    "tractor": Machine({"tractor": "vehicle", "driver": "vehicle_mission"}, 15),
+    "tractor": Machine({"tractor": "vehicle", "driver": "vehicle_mission", "computer": "computer"}, 15),
     "air-blast sprayer": Machine({"airblast": "airblast_sprayer", "ultrasonic": "ultrasonic_sensors",
                                   "mission": "airblast_mission"}, 20),
 }
@@ -36,7 +36,8 @@ MEAN_GAP_S = 100.0
 SHORTEST_S, LONGEST_S = 2.0, 90.0
 SLOW: Mapping[str, tuple[float, float]] = {
     "coolant": (40, 240), "alternator": (15, 150), "level_sensor": (20, 150), "main_tank": (20, 90), "engine": (5, 150),
-    "sensor": (4, 60), "boom": (10, 90), "burner": (5, 120)}
+    "sensor": (4, 60), "boom": (10, 90), "burner": (5, 120), "cpu": (40, 180), "board": (60, 240), "memory": (40, 120),
+    "storage": (20, 120), "clock": (90, 400)}
 """Devices whose faults need longer to show, s."""
 FILLED: Mapping[str, str] = {"main_tank": "filled", "dis_tank": "filled", "tank": "filled"}
 """Someone fills what was emptied."""
@@ -96,6 +97,8 @@ def _settings(program: str, dice: Random) -> dict[str, float]:
             return {"main_tank": dice.uniform(80, 200), "dis_tank": dice.uniform(4, 10)}
         case "vehicle":
             return {"speed": dice.uniform(0.8, 3), "turn_speed": dice.uniform(0.6, 2), "fuel": dice.uniform(25, 100)}
+        case "computer":
+            return {"ambient": dice.uniform(5, 35)}
         case "ultrasonic_sensors":
             return {"speed": dice.uniform(1.5, 4), "trees_missing": dice.uniform(0, 30)}
         case _:

@@ -6,6 +6,7 @@ from typing import cast
 
 from firmware_py.airblast_sprayer import AirblastSprayer
 from firmware_py.codec import Codec, Value
+from firmware_py.computer import Computer
 from firmware_py.flaming_tool import FlamingTool
 from firmware_py.node import Node
 from firmware_py.sprayer_boom import SprayerBoom
@@ -60,6 +61,11 @@ class World:
     def tractor(self) -> Vehicle:
         """The vehicle."""
         return cast(Vehicle, self.nodes["tractor"])
+
+    @property
+    def computer(self) -> Computer:
+        """The computer of the UCS."""
+        return cast(Computer, self.nodes["computer"])
 
     @property
     def airblast(self) -> AirblastSprayer:
