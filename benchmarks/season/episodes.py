@@ -1,7 +1,7 @@
 """Whether the events of level 1 make sense by themselves: each step of an alarm's life only after the one it needs."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from level1.catalog import Catalog
 from level1.event import Event
@@ -9,7 +9,7 @@ from level1.event import Event
 
 @dataclass
 class _Life:
-    """An alarm that was raised. repairs: attempt under way; attempt: number of the last one."""
+    """An alarm that was raised. repairs: attempt under way; attempt: number of the last one; good_s: when good ones began."""
 
     alarm: str
     keyed: bool
@@ -17,6 +17,7 @@ class _Life:
     locked: bool = False
     seen: bool = False
     attempt: int = 0
+    good_s: list[float] = field(default_factory=list)
 
 
 class Episodes:
@@ -65,6 +66,8 @@ class Episodes:
                 if not life.repairs or event.attempt != life.attempt:
                     self._mark(event, "that attempt was not under way")
                 life.repairs = False
+                if event.event == "repaired":
+                    life.good_s.append(self._begun_s[event.alarm][-1])
             case "locked_out":
                 if life.repairs or life.locked:
                     self._mark(event, "an attempt is under way, or it is locked out already")
@@ -76,6 +79,7 @@ class Episodes:
                 latched = self._catalog.alarms[event.alarm].latch
                 if life.repairs or life.locked or latched and not life.seen:
                     self._mark(event, "a repair, a lock-out or a latch holds it")
+                self._give_back(event, life)
                 del self._lives[event.instance]
             case _:
                 self._mark(event, "no such step")
@@ -91,6 +95,12 @@ class Episodes:
             self._begun_s[event.alarm] = [*begun, now_s]
             if len(begun) >= repair.attempts:
                 self._mark(event, f"its budget of {repair.attempts} attempts in {repair.window_ns / 1e9:g} s is spent")
+
+    def _give_back(self, event: Event, life: _Life) -> None:
+        """What was good does not use up the budget where the definition says so."""
+        repair = self._catalog.alarms[event.alarm].repair
+        if repair is not None and not repair.counts_good:
+            self._begun_s[event.alarm] = [one for one in self._begun_s.get(event.alarm, []) if one not in life.good_s]
 
     def _mark(self, event: Event, why: str) -> None:
         self.wrong.append(f"{event.t:.3f} s: {event.alarm} {event.event} ({event.seq} of {event.instance}): {why}")

@@ -109,7 +109,7 @@ FLAMER: Mapping[str, Row] = {
     "burner stuck high": Row((WRONG_BURNER,)),
     "refuses start": Row((WRONG_MODE,)),
     "refuses stop": Row((WRONG_MODE,)),
-    "bottle empty": Row((BOTTLE_EMPTY, BOTTLE_LOW), (*OUT, "PilotIgnitionFailure"), 1e6),
+    "bottle empty": Row((BOTTLE_EMPTY, BOTTLE_LOW), (*OUT, "PilotIgnitionFailure"), 2 * GAS_TAIL_S),
     "flame_sensor stuck on": Row((FALSE_FLAME,), ("FlamingStartStopFailure", *OUT), GAS_TAIL_S),
     "flame_sensor stuck off": Row((FLAME_OUT, UNLIT), OUT, GAS_TAIL_S),
     "silent": Row((FLAMER_QUIET,), OUT),

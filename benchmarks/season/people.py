@@ -51,6 +51,8 @@ class People:
             self._tell("mission", "flaming", "off", None)
         elif mission.state == "Idle":
             self._tell("mission", "flaming", "on", None)
+        if self._world.flamer.plant.bottle.level_percent < 12 and self._now_and_then(0.05):
+            self._tell("flamer", "bottle", "changed", None)
         if self._first or self._now_and_then(0.15):
             self._tell("mission", "burner", self._dice.choice(["off", "low", "high"]), self._dice.choice([None, 1, 2, 3, 4]))
 
@@ -77,6 +79,8 @@ class People:
                 self._tell("tractor", "start_button", "pressed", None)
             case "Paused" if self._now_and_then(0.5):
                 self._tell("driver", "mission", "resume", None)
+            case "Ready" if tractor.mission == "Finished":
+                self._tell("tractor", "path", "loaded", None)
             case "Ready":
                 self._tell("driver", "mission", "start", None)
             case "Executing" if self._now_and_then(0.03):

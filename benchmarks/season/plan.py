@@ -35,15 +35,14 @@ MEAN_GAP_S = 100.0
 """Between two faults."""
 SHORTEST_S, LONGEST_S = 2.0, 90.0
 SLOW: Mapping[str, tuple[float, float]] = {
-    "coolant": (40, 240), "alternator": (15, 150), "level_sensor": (20, 150), "main_tank": (20, 90), "engine": (5, 150),
+    "coolant": (40, 240), "alternator": (15, 150), "level_sensor": (20, 150), "main_tank": (20, 90), "bottle": (20, 120),
+    "engine": (5, 150),
     "sensor": (4, 60), "boom": (10, 90), "burner": (5, 120), "cpu": (40, 180), "board": (60, 240), "memory": (40, 120),
     "storage": (20, 120), "clock": (90, 400)}
 """Devices whose faults need longer to show, s."""
-FILLED: Mapping[str, str] = {"main_tank": "filled", "dis_tank": "filled", "tank": "filled"}
-"""Someone fills what was emptied."""
-NO_FAULTS = {("main_tank", "filled"), ("dis_tank", "filled"), ("tank", "filled"), ("start_button", "pressed")}
-AT_THE_END = {("bottle", "empty")}
-"""Nobody can put that right on this day."""
+FILLED: Mapping[str, str] = {"main_tank": "filled", "dis_tank": "filled", "tank": "filled", "bottle": "changed"}
+"""Someone fills, or changes, what was emptied."""
+NO_FAULTS = {("start_button", "pressed"), ("path", "loaded"), *FILLED.items()}
 MAX_COMMANDS = 4
 
 
@@ -108,7 +107,7 @@ def _settings(program: str, dice: Random) -> dict[str, float]:
 def _faults(programs: Mapping[str, str], dice: Random, until_ns: int) -> list[Fault]:
     """Faults at random times. One device has one fault at a time: `works` would end them all; devices overlap freely."""
     kinds = [(node, program, phrase) for node, program in programs.items() for phrase in PROGRAMS[program].FAULTS
-             if phrase.action != WORKS and (phrase.device, phrase.action) not in NO_FAULTS | AT_THE_END]
+             if phrase.action != WORKS and (phrase.device, phrase.action) not in NO_FAULTS]
     free_ns: dict[tuple[str, str, int | None], int] = {}
     faults = []
     t_s = dice.uniform(30, 90)
@@ -120,8 +119,6 @@ def _faults(programs: Mapping[str, str], dice: Random, until_ns: int) -> list[Fa
             free_ns[place] = (fault.until_ns or fault.t_ns) + 30 * S
             faults.append(fault)
         t_s += dice.expovariate(1 / MEAN_GAP_S)
-    if "flaming_tool" in programs.values() and dice.random() < 0.3:
-        faults.append(Fault(until_ns + 60 * S, "flamer", "flaming_tool", Statement("bottle", None, "empty")))
     return faults
 
 
