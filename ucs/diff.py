@@ -16,7 +16,7 @@ from level1.expression import And, Arithmetic, Compare, Expression, Function, No
 from level1.io import config, definitions
 from level1.io.error import OutsideError, did_you_mean
 from ucs import parquet, season
-from ucs.comparison import Comparison, Recorded, Side, span_text
+from ucs.comparison import Comparison, Recorded, Side, rate_rows, span_text
 from ucs.render import painted, wants_colour
 from ucs.spans import Behaviour, Change, behaviour, changes, spans
 from ucs.table import aligned
@@ -86,8 +86,8 @@ def compare(paths: Sequence[str], old: tuple[str, Catalog], new: tuple[str, Cata
     outcomes = _outcomes(paths, [old[1], new[1]], args)
     _write_table(args.parquet, (old[0], new[0]), outcomes)
     recorded = _recorded(outcomes[0])
-    sides = [Side(name, {outcome.path: spans(outcome.decoded()) for outcome in found})
-             for (name, _), found in zip((old, new), outcomes, strict=True)]
+    sides = [Side(name, {outcome.path: spans(outcome.decoded()) for outcome in found}, tuple(files))
+             for (name, _), found, files in zip((old, new), outcomes, (args.dbc, args.against), strict=True)]
     found = {each.path: changes(sides[0].found[each.path], sides[1].found[each.path], args.tolerance) for each in recorded}
     return Comparison(sides[0], sides[1], recorded, found, args.tolerance)
 
@@ -216,14 +216,14 @@ def _print(compared: Comparison) -> None:
                      f"{old.standing_s:.0f} → {new.standing_s:.0f} s", f"{old.chatter} → {new.chatter}",
                      Path((new.first or old.first or ("", 0.0))[0]).name))
     print(*aligned(rows) if len(rows) > 1 else ["no alarm on either side"], sep="\n")
-    before, after = compared.floods(compared.old), compared.floods(compared.new)
-    if before or after:
-        print(f"floods (more than 10 alarms in 10 min): {before} → {after}")
+    if len(rows) > 1:
+        print(*aligned([("for one operator", "old", "new", "IEC 62682 asks for"), *rate_rows(compared)]), sep="\n")
     for each in compared.recorded:
         for change in compared.changes[each.path]:
             print(_change_line(each, change, colour))
     total = sum(map(len, compared.changes.values()))
-    print(f"{total} {'difference' if total == 1 else 'differences'}" if total else "no difference")
+    kinds = ", ".join(f"{count} {what}" for what, count in compared.kinds().items())
+    print(f"{total} {'difference' if total == 1 else 'differences'}: {kinds}" if total else "no difference")
 
 
 _SIGNS = {"appeared": ("+", "32"), "vanished": ("-", "31")}
@@ -243,7 +243,7 @@ def as_object(compared: Comparison) -> Mapping[str, Any]:
     """The comparison for programs."""
     return {
         "recordings": len(compared.recorded), "hours": compared.hours,
-        "floods": {"old": compared.floods(compared.old), "new": compared.floods(compared.new)},
+        "rates": {side.name: compared.rates(side)._asdict() for side in (compared.old, compared.new)},
         "alarms": {alarm: {side.name: _behaviour_object(compared.behaviour(side, alarm)) for side in (compared.old, compared.new)}
                    for alarm in compared.alarms()},
         "changes": [{"recording": path, "alarm": change.alarm, "what": change.what,

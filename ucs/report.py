@@ -6,11 +6,12 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 
-from ucs.comparison import Comparison, Recorded, span_text
+from ucs.comparison import Comparison, Recorded, rate_rows, span_text
 from ucs.spans import Behaviour, Span
 
 WIDTH, LABEL, ROW = 760, 190, 26
 OLD, NEW = "#adb5bd", "#1864ab"
+COLOURS = {"appeared": "#2b8a3e", "vanished": "#c92a2a"}
 MOST_PICTURES = 200
 """Recordings drawn at most, those with differences first; the tables hold all."""
 
@@ -20,7 +21,9 @@ def comparison_html(compared: Comparison) -> str:
     total = sum(map(len, compared.changes.values()))
     body = [f"<h1>Alarms: {escape(compared.old.name)} against {escape(compared.new.name)}</h1>",
             f"<p>{len(compared.recorded)} recordings, {compared.hours:.2f} h. "
-            f"<b>{total or 'No'} difference{'' if total == 1 else 's'}.</b></p>", _alarm_table(compared)]
+            f"<b>{total or 'No'} difference{'' if total == 1 else 's'}{_kinds(compared)}.</b></p>",
+            *(f"<p class=small>{side.name}: {escape(', '.join(side.files))}</p>" for side in (compared.old, compared.new)),
+            _alarm_table(compared), _rate_table(compared)]
     if total:
         body += ["<h3>Differences</h3>", _change_table(compared)]
     drawn = sorted(compared.recorded, key=lambda each: -len(compared.changes[each.path]))
@@ -59,25 +62,47 @@ def _page(title: str, body: Sequence[str]) -> str:
             f"<style>{style}</style><body class=wide>{''.join(body)}</body></html>")
 
 
+def _kinds(compared: Comparison) -> str:
+    kinds = compared.kinds()
+    return ": " + ", ".join(f"{count} {what}" for what, count in kinds.items()) if kinds else ""
+
+
+def _rate_table(compared: Comparison) -> str:
+    if not compared.alarms():
+        return ""
+    rows = "".join(f"<tr><td>{name}</td><td>{old}</td><td>{new}</td><td>{asked}</td></tr>"
+                   for name, old, new, asked in rate_rows(compared))
+    return ("<h3>For one operator</h3><table><tr><th></th><th>Old</th><th>New</th><th>IEC 62682 asks for</th></tr>"
+            f"{rows}</table>")
+
+
+def _where(compared: Comparison, place: tuple[str, float] | None) -> str:
+    """A recording and the time in it."""
+    if place is None:
+        return ""
+    start = next(each.start for each in compared.recorded if each.path == place[0])
+    return f"{escape(Path(place[0]).name)} {place[1] - start:.1f} s"
+
+
 def _alarm_table(compared: Comparison) -> str:
     rows = []
     for alarm in compared.alarms():
         old, new = (compared.behaviour(side, alarm) for side in (compared.old, compared.new))
         strong = "b" if old.raised != new.raised else "span"
-        first = new.first or old.first
         rows.append(f"<tr><td>{escape(alarm)}</td><td>{old.raised}</td><td><{strong}>{new.raised}</{strong}></td>"
                     f"<td>{old.per_hour:.2f} → {new.per_hour:.2f}</td><td>{old.standing_s:.0f} → {new.standing_s:.0f} s</td>"
                     f"<td>{old.chatter} → {new.chatter}</td><td>{old.stale} → {new.stale}</td>"
-                    f"<td>{escape(Path(first[0]).name) if first else ''}</td></tr>")
+                    f"<td>{old.locked_out} → {new.locked_out}</td><td>{_where(compared, new.first or old.first)}</td>"
+                    f"<td>{_where(compared, new.last or old.last)}</td></tr>")
     if not rows:
         return "<p>No alarm on either side.</p>"
-    flood = f"<p>Floods, more than 10 alarms in 10 minutes: {compared.floods(compared.old)} → {compared.floods(compared.new)}</p>"
     return ("<h3>Alarms</h3><table><tr><th>Alarm</th><th>Old</th><th>New</th><th>Per hour</th><th>Standing</th><th>Chattered</th>"
-            f"<th>Stale</th><th>First in</th></tr>{''.join(rows)}</table>{flood}")
+            f"<th>Stale</th><th>Locked out</th><th>First</th><th>Last</th></tr>{''.join(rows)}</table>")
 
 
 def _change_table(compared: Comparison) -> str:
-    rows = "".join(f"<tr><td>{escape(Path(each.path).name)}</td><td>{escape(change.alarm)}</td><td>{change.what}</td>"
+    rows = "".join(f"<tr><td>{escape(Path(each.path).name)}</td><td>{escape(change.alarm)}</td>"
+                   f"<td style=\"color:{COLOURS.get(change.what, 'inherit')}\">{change.what}</td>"
                    f"<td>{escape(span_text(each, change))}</td></tr>"
                    for each in compared.recorded for change in compared.changes[each.path])
     return f"<table><tr><th>Recording</th><th>Alarm</th><th>What</th><th>Old → new</th></tr>{rows}</table>"

@@ -1,6 +1,7 @@
 """Alarms as spans of time, what two sets of spans have in common, and how an alarm behaves (IEC 62682)."""
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -152,6 +153,12 @@ def bursts(starts: Sequence[float], count: int, window_s: float) -> int:
         else:
             place += 1
     return found
+
+
+def busiest(found: Sequence[Span]) -> int:
+    """How many alarms came within the busiest ten minutes."""
+    starts = sorted(span.start for span in found)
+    return max((place + 1 - bisect_left(starts, start - FLOOD_S) for place, start in enumerate(starts)), default=0)
 
 
 def floods(found: Sequence[Span]) -> int:

@@ -12,7 +12,7 @@ import pytest
 from level1.io.definitions import load
 from level1.io.error import OutsideError
 from ucs import main, season
-from ucs.spans import Span, behaviour, bursts, changes, floods
+from ucs.spans import Span, behaviour, bursts, busiest, changes, floods
 
 TEXT = """VERSION ""
 NS_ :
@@ -59,7 +59,8 @@ def test_alarms_that_vanish_and_move_are_told_and_make_the_exit_code(folder: Pat
     assert code == 1
     assert "- short.log  TankLow                      vanished         2.500 s to 3.000 s → not raised" in out
     assert "~ long.log  TankLow                      moved            2.500 s to 5.000 s → 4.000 s to 5.000 s" in out
-    assert out.endswith("2 differences\n")
+    assert "alarms in the busiest 10 min    1    1    at most 10" in out
+    assert out.endswith("2 differences: 1 moved, 1 vanished\n")
 
 
 def test_the_same_definitions_differ_in_nothing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -75,7 +76,9 @@ def test_json_and_html(folder: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert code == 1 and told["alarms"]["TankLow"]["old"]["raised"] == 2 and told["alarms"]["TankLow"]["new"]["raised"] == 1
     assert sorted(change["what"] for change in told["changes"]) == ["moved", "vanished"]
     page = report.read_text()
+    assert told["rates"]["old"] == {"average": None, "busiest": 1, "floods": 0, "chattered": 0, "stale": 0}, "7 s tell no average"
     assert "http" not in page and "vanished" in page and page.count("<rect") == 3
+    assert str(folder / "new.dbc") in page and "IEC 62682 asks for" in page and "long.log 4.0 s" in page
 
 
 @pytest.mark.parametrize(("sweep", "raised"), [
@@ -184,6 +187,7 @@ def test_chatter_and_floods_by_the_standards_figures() -> None:
     assert bursts([0, 10, 20, 100, 110, 120, 500], 3, 60) == 2
     assert floods([Span("A", n * 50.0, None, 0, "") for n in range(11)]) == 1
     assert floods([Span("A", n * 70.0, None, 0, "") for n in range(11)]) == 0
+    assert busiest([Span("A", n * 70.0, None, 0, "") for n in range(11)]) == 9 and busiest([]) == 0
     found = behaviour([("one", 200.0, [Span("A", 0, 10, 0, "locked_out"), Span("A", 100, None, 0, "")])], 2.0)
     assert (found.raised, found.per_hour, found.standing_s, found.locked_out) == (2, 1.0, 110.0, 1)
     assert (found.first, found.last) == (("one", 0), ("one", 100))
