@@ -57,7 +57,7 @@ class Host(msgspec.Struct, frozen=True):
 class Loop(msgspec.Struct, frozen=True):
     """State of the supervision itself since the last reading. lateness_ns: the largest; None: not known.
     bus_state: a word of `BUS_STATES`. journal: a word of the signal JournalState. storage_writes: whether the last write to
-    the storage succeeded. recorder_works: None where nothing is recorded; recorder_dropped: frames it could not take."""
+    the storage succeeded. recorder_works: None where nothing is recorded; recorder_dropped: frames not recorded since the start."""
 
     lateness_ns: int | None = None
     frames_dropped: int | None = None

@@ -69,7 +69,7 @@ class Housekeeping:
                  gnss: Satellites | None = None):
         self._watch, self._buses, self._journal, self._recorder, self._gnss = watch, buses, journal, recorder, gnss
         self._lateness_ns = 0
-        self._dropped = self._not_recorded = 0
+        self._dropped = 0
 
     def take(self, lateness_ns: int, dropped: int) -> list[Reading]:
         """The readings since the last call, none within a period. lateness_ns: of this turn of the loop; dropped: frames lost
@@ -88,15 +88,12 @@ class Housekeeping:
     def _loop(self, dropped: int) -> Loop:
         fault = self._journal.fault
         recorder = self._recorder
-        not_recorded = 0 if recorder is None else recorder.dropped
-        state = Loop(
+        return Loop(
             lateness_ns=self._lateness_ns, frames_dropped=dropped - self._dropped, bus_state=bus_state(self._buses),
             bus_load_percent=max((bus.load_percent for bus in self._buses if bus.load_percent is not None), default=None),
             journal=journal_word(fault), storage_writes=fault is None,
             recorder_works=None if recorder is None else recorder.fault is None,
-            recorder_dropped=None if recorder is None else not_recorded - self._not_recorded)
-        self._not_recorded = not_recorded
-        return state
+            recorder_dropped=None if recorder is None else recorder.dropped)
 
 
 def bus_state(buses: Sequence[Bus]) -> str | None:

@@ -16,7 +16,7 @@ import os
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -51,7 +51,7 @@ class Recorder:
     """Records the traffic of all buses in a folder.
 
     max_bytes: of all its files together. clock, wall: monotonic and wall clock, ns. notice: called with a line when recording
-    fails or works again. dropped: frames not recorded so far, at least. reserve_bytes, queue_frames: see above.
+    fails or works again. dropped: frames not recorded so far. reserve_bytes, queue_frames: see above.
     """
 
     def __init__(self, folder: Path, max_bytes: int, *, clock: Callable[[], int], wall: Callable[[], int],
@@ -66,7 +66,7 @@ class Recorder:
         self._dropped_ns: int | None = None
         self._retry_ns = clock()
         self._file: _File | None = None
-        self._unsafe = 0
+        self._busy = False
         self._lock = threading.Lock()
         self._filled, self._stopping, self._renewed = threading.Event(), threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="traffic recorder", daemon=True)
@@ -129,27 +129,26 @@ class Recorder:
         if self._fault is not None and now_ns < self._retry_ns and not renewed:
             self._forget(self._waiting())
             return
+        portion: deque[Frame | Send] = deque()
+        self._busy = True
         try:
             if renewed:
                 self._renewed.clear()
                 self._begin_anew()
-            if self._file is not None and not self._file.in_place:
-                self._file.abandon()
-                self._file = None
+            self._leave_what_is_not_in_place()
             self._make_room()
             while portion := self._portion():
-                self._unsafe += len(portion)
                 self._write(portion)
                 if not self._stopping.is_set():
                     self._stopping.wait(NAP_S)
             if self._file is not None:
                 self._file.flush()
-            self._unsafe = 0
         except Exception as error:  # a thread that ended would record nothing for ever
             self._fail(error)
-            self._forget(self._unsafe + self._waiting())
-            self._unsafe = 0
+            self._forget(len(portion) + self._waiting())
             return
+        finally:
+            self._busy = False
         if self._fault is not None and self._file is not None:
             self._fault = None
             self._dropped_ns = None  # what was dropped meanwhile was told as this fault
@@ -162,9 +161,9 @@ class Recorder:
             self._file = None
         self._notice(f"traffic recorder {self.folder}: begins a new file")
 
-    def _portion(self) -> list[Frame | Send]:
+    def _portion(self) -> deque[Frame | Send]:
         with self._lock:
-            return [self._queue.popleft() for _ in range(min(PORTION, len(self._queue)))]
+            return deque(self._queue.popleft() for _ in range(min(PORTION, len(self._queue))))
 
     def _waiting(self) -> int:
         with self._lock:
@@ -178,8 +177,10 @@ class Recorder:
                 self.dropped += count
             self._dropped_ns = self._clock()
 
-    def _write(self, portion: Iterable[Frame | Send]) -> None:
-        for item in portion:
+    def _write(self, portion: deque[Frame | Send]) -> None:
+        """Write and take out one after the other: what is left then was not written."""
+        while portion:
+            item = portion[0]
             if self._file is not None and self._file.size > self._file_bytes - 2 * CONTAINER_BYTES:
                 self._file.close()
                 self._file = None
@@ -189,11 +190,19 @@ class Recorder:
                 self._file = _File(self._next_path(), self._wall() - self._clock(), item)
             else:
                 self._file.add(item)
+            portion.popleft()
+
+    def _leave_what_is_not_in_place(self) -> None:
+        """Finish the file if someone has moved it; what was deleted, or is on a card that was pulled, is lost."""
+        file = self._file
+        if file is not None and not file.in_place:
+            self._file = None
+            self._forget(file.leave())
 
     def _fail(self, error: Exception) -> None:
         text = error.strerror if isinstance(error, OSError) and error.strerror else str(error) or type(error).__name__
         if self._file is not None:
-            self._file.abandon()
+            self._forget(self._file.abandon())
             self._file = None
         if self._fault is None:
             self._notice(f"traffic recorder {self.folder}: not recorded ({text}); trying again")
@@ -249,7 +258,9 @@ class _File:
             with can.BLFWriter(path) as writer:
                 writer.on_message_received(self._message(first))
             self._writer = can.BLFWriter(path, append=True, max_container_size=CONTAINER_BYTES)
-            self._good = path.stat().st_size
+            self._good = self._end = path.stat().st_size
+            self._added = self._kept = 1
+            self._pending = 0
         except BaseException:
             with suppress(OSError):
                 path.unlink()
@@ -271,22 +282,38 @@ class _File:
     def add(self, item: Frame | Send) -> None:
         """Write a frame."""
         self._writer.on_message_received(self._message(item))
+        self._added += 1
+        self._pending += 1
+        if self._writer.file.tell() != self._end:  # a container is full; a frame that it cuts is not whole in it
+            self._end = self._writer.file.tell()
+            self._pending = int(self._writer.file_size() > self._end)
 
     def flush(self) -> None:
         """Hand finished containers to the system. Raises OSError when the disk does not take them."""
         self._writer.file.flush()
         self._good = self._writer.file.tell()
+        self._kept = self._added - self._pending
 
     def close(self) -> None:
         """Finish the file."""
         self._writer.stop()
 
-    def abandon(self) -> None:
-        """Give up, and cut off what may be half written."""
+    def leave(self) -> int:
+        """Finish the file wherever it is now; gives the frames that are lost."""
+        try:
+            is_deleted = os.fstat(self._writer.file.fileno()).st_nlink == 0
+            self._writer.stop()
+        except (OSError, ValueError):
+            return self.abandon()
+        return self._added if is_deleted else 0
+
+    def abandon(self) -> int:
+        """Give up, and cut off what may be half written; gives the frames that are lost."""
         with suppress(Exception):
             self._writer.file.close()
         with suppress(OSError):
             os.truncate(self.path, self._good)
+        return self._added - self._kept
 
     def _message(self, item: Frame | Send) -> can.Message:
         key = item.key

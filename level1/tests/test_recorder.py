@@ -46,7 +46,7 @@ class Bench:
             time.sleep(0.005)
 
     def drained(self) -> bool:
-        return not self.recorder._queue and not self.recorder._unsafe
+        return not self.recorder._queue and not self.recorder._busy
 
     def files(self) -> list[Path]:
         return sorted(self.folder.glob("*.blf"))
@@ -183,6 +183,7 @@ def test_a_disk_that_takes_no_more_is_told_and_recording_goes_on_when_it_does(be
     assert one.recorder.fault is None, "at once: a repair waits for it"
     one.recorder.stop()
     whole = [bytes(message.data) for path in one.files() for message in messages(path)]
+    assert len(whole) + one.recorder.dropped == 15_020, "each is there or counted"
     first = [frame.data for frame in noise(5_000)]
     assert whole[:4000] == first[:4000] and whole[-10:] == [frame.data for frame in noise(10, 3)]
 
@@ -240,6 +241,18 @@ def test_a_folder_taken_away_while_recording_is_made_anew(tmp_path: Path, bench:
     one.until(lambda: one.files())
     one.recorder.stop()
     assert len(messages(one.files()[0])) == 100 and one.recorder.fault is None
+    assert [len(messages(path)) for path in (tmp_path / "elsewhere").iterdir()] == [100] and one.recorder.dropped == 0
+
+
+def test_a_file_deleted_while_recording_is_lost_and_counted(bench: Callable[..., Bench]) -> None:
+    one = bench()
+    one.recorder.record(noise(100))
+    one.until(lambda: one.drained() and one.files())
+    one.files()[0].unlink()
+    one.recorder.record(noise(50))
+    one.until(lambda: one.drained() and one.files())
+    one.recorder.stop()
+    assert one.recorder.dropped == 100 and len(messages(one.files()[0])) == 50
 
 
 def test_it_begins_a_new_file_when_it_is_asked_to_and_loses_nothing(bench: Callable[..., Bench]) -> None:
