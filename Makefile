@@ -15,7 +15,7 @@ help:
 	@echo "make test-wheel  the unit tests against the built and installed wheel"
 	@echo "make golden      declare the events that the examples give now (see examples/README.md)"
 	@echo "make coverage    write docs/coverage.md: which tests prove which line of the specification"
-	@echo "make soak        kills, power cuts and forged commands at length: about ten minutes"
+	@echo "make soak        kills, power cuts, forged commands and pulled plugs at length: about 17 minutes"
 	@echo "make season      1,000 h of virtual time with random faults: hours; goes on where it was stopped"
 	@echo "make clean       remove what these made"
 
@@ -49,6 +49,7 @@ test-wheel: $(VENV)/ready
 # Writes its counts into docs/reliability.md.
 soak: $(VENV)/ready packages-vcan
 	$(BIN)/python -m benchmarks.soak --write
+	$(BIN)/python -m benchmarks.plugs --write
 
 # Writes its counts into docs/reliability.md, too.
 season: $(VENV)/ready

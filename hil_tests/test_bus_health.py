@@ -184,6 +184,28 @@ def test_an_identifier_that_babbles_is_named(run: Process, plug: Plug, can_id: i
     run.expect("Babbling +cleared", OVER_S)
 
 
+def test_babble_that_the_kernels_gateway_forwards_is_told_of_both_buses(run: Process, plug: Plug) -> None:
+    subprocess.run(["cangw", "-A", "-s", "vcan0", "-d", "vcan1", "-e", "-f", "2A7:7FF"], check=True)
+    stop = threading.Event()
+
+    def babble() -> None:
+        with Wire() as wire:
+            while not stop.wait(0.01):
+                for _ in range(20):
+                    wire.send(0x2A7, bytes(8))
+    thread = threading.Thread(target=babble)
+    thread.start()
+    try:
+        heard = {run.expect(r"Babbling +raised.*Bus (\w+), Id 2A7", 2 * IN_TIME_S).group(1) for _ in range(2)}
+    finally:
+        stop.set()
+        thread.join()
+        subprocess.run(["cangw", "-F"], check=True)
+    assert heard == {"tractor", "implement"}
+    for _ in range(2):
+        run.expect("Babbling +cleared", OVER_S)
+
+
 def test_frames_the_kernel_had_to_drop_are_told(run: Process, plug: Plug) -> None:
     os.kill(run.pid, signal.SIGSTOP)  # not the group: `ip` and others of the test go on
     with Wire() as wire:

@@ -81,6 +81,20 @@ def test_the_address_is_claimed_defended_and_given_up_to_a_stronger_name(process
         running.expect("AddressConflict +raised")
 
 
+def test_the_kernels_own_claim_with_a_stronger_name_takes_the_address(supervisor: Any) -> None:
+    time.sleep(0.5)
+    with socket.socket(socket.PF_CAN, socket.SOCK_DGRAM, socket.CAN_J1939) as stronger:
+        stronger.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        stronger.bind(("vcan0", 1, socket.J1939_NO_PGN, UCS))
+        with can.Bus("vcan0", interface="socketcan") as bus:
+            stronger.sendto((1).to_bytes(8, "little"), ("vcan0", socket.J1939_NO_NAME, 0xEE00, socket.J1939_NO_ADDR))
+            assert heard(bus, ADDRESS_CLAIM | UCS + 1) not in (b"", (1).to_bytes(8, "little"))
+        supervisor.expect("AddressConflict +raised.*SourceAddress 128")
+        time.sleep(0.4)
+        stronger.sendto(dm1(100), ("vcan0", socket.J1939_NO_NAME, DM1, socket.J1939_NO_ADDR))
+        supervisor.expect("TroubleCode +raised .*SourceAddress 128, SPN 100")
+
+
 def heard(bus: can.BusABC, can_id: int) -> bytes:
     """The payload of the next frame with this identifier."""
     end = time.monotonic() + 10

@@ -43,8 +43,8 @@ class Reading(NamedTuple):
 
 
 class Host(msgspec.Struct, frozen=True):
-    """State of the computer; None: it can't be measured here. load: runnable tasks for each processor, mean of a minute.
-    clock_synchronised: whether something keeps the wall clock right."""
+    """State of the computer; None: it can't be measured here; NaN: its sensor can't be read any more. load: runnable tasks for each
+    processor, mean of a minute. clock_synchronised: whether something keeps the wall clock right."""
 
     cpu_celsius: float | None = None
     mainboard_celsius: float | None = None

@@ -176,6 +176,7 @@ def health_events(seconds: int, raws: Mapping[str, int]) -> list[str]:
     ({"JournalState": 2}, ["JournalFault 2"]),
     ({"LoopLateness": 51}, ["LoopLate 5"]),
     ({"BusState": 4}, []),  # reported by who looks after the bus
+    ({"CpuTemperature": 0xFE}, ["HealthNotMeasured 2"]),
     ({"BusLoad": 201}, ["BusOverloaded 10"]),
     ({"CpuTemperature": 0xFF, "MainboardTemperature": 0xFF, "TimeSync": 3, "BusState": 15, "GnssQuality": 7}, []),
 ])

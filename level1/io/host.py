@@ -1,11 +1,13 @@
 """The computer itself: temperatures, memory, storage, load, clock, measured once a period by a thread of its own.
 
 A sensor that hangs (a chip behind a slow bus, a dead disk) must not hold supervision, so only this thread waits for it; its
-readings then fail to come, and the silence of UCS_HEALTH raises an alarm. What a computer has no sensor for stays unknown.
+readings then fail to come, and the silence of UCS_HEALTH raises an alarm. What a computer has no sensor for stays unknown; a
+sensor that was there and can't be read any more is an error.
 """
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -22,6 +24,8 @@ BOARD_WORDS = ("acpitz", "board", "system", "systin", "pch", "ambient", "jc42", 
 """The same for the mainboard. Everything else (disks, radios, graphics) is neither."""
 LOWEST_C, HIGHEST_C = -40.0, 125.0
 """What a working sensor can read; others give 0x00, 0xFF or -128 when they are broken or not wired."""
+MEASURED = ("cpu_celsius", "mainboard_celsius", "ram_used_percent", "storage_used_percent")
+"""What a sensor says: once there, it must not become unknown."""
 _TIME_ERROR = 5
 
 
@@ -99,6 +103,7 @@ class HostWatch:
     def __init__(self, period_ns: int, measure: Callable[[], Host], clock: Callable[[], int], told: Callable[[], None]):
         self._period_ns, self._measure, self._clock, self._told = period_ns, measure, clock, told
         self._latest: tuple[int, Host] | None = None
+        self._seen: set[str] = set()
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="host", daemon=True)
@@ -126,11 +131,17 @@ class HostWatch:
                 host = self._measure()
             except Exception:  # a sensor's driver may do anything; unknown is the answer then
                 host = Host()
+            host = self._with_errors(host)
             with self._lock:
                 self._latest = (self._clock(), host)
             self._told()
             due_ns = max(due_ns + self._period_ns, self._clock())
             self._stopping.wait((due_ns - self._clock()) / 1e9)
+
+    def _with_errors(self, host: Host) -> Host:
+        """NaN where a sensor was there and is no more."""
+        self._seen |= {name for name in MEASURED if getattr(host, name) is not None}
+        return msgspec.structs.replace(host, **{name: math.nan for name in self._seen if getattr(host, name) is None})
 
 
 def _hottest(zones: list[tuple[str, float]], words: tuple[str, ...]) -> float | None:

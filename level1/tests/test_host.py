@@ -1,6 +1,7 @@
 """The state of the computer: what it has sensors for is read, what it has none for stays unknown."""
 from __future__ import annotations
 
+import math
 import os
 import threading
 import time
@@ -165,6 +166,14 @@ class TestWatch:
         assert watch.take() is None
         hang.set()
         watch.stop()
+
+    def test_a_sensor_that_was_there_and_is_gone_is_an_error_and_one_that_never_was_is_unknown(self) -> None:
+        answers = [Host(cpu_celsius=50.0, storage_used_percent=10.0), Host(storage_used_percent=10.0), Host(cpu_celsius=51.0)]
+        watch, _ = self.watch(Host)
+        found = [watch._with_errors(host) for host in answers]
+        assert (found[0].cpu_celsius, found[0].mainboard_celsius) == (50.0, None)
+        assert math.isnan(found[1].cpu_celsius or 0) and (found[1].storage_used_percent, found[1].mainboard_celsius) == (10.0, None)
+        assert found[2].cpu_celsius == 51.0 and math.isnan(found[2].storage_used_percent or 0)
 
     def test_a_driver_that_raises_leaves_everything_unknown_and_is_asked_again(self) -> None:
         answers: list[Any] = [RuntimeError("a driver"), OSError(5, "I/O error")]
