@@ -104,12 +104,12 @@ def distance_m(one: Place, other: Place) -> float:
     return 2 * EARTH_M * math.asin(math.sqrt(min(a, 1.0)))
 
 
-def jump_m(one: Place, other: Place) -> float | None:
-    """By how many metres the second place lies beyond the reach of the speeds; None: too long after the first to say."""
+def jump_m(one: Place, other: Place, judged_ns: int = JUDGED_NS) -> float | None:
+    """By how many metres the second place lies beyond the reach of the speeds; None: longer after the first than can be judged."""
     passed_ns = other.t_ns - one.t_ns
     if one.time_of_day_ns is not None and other.time_of_day_ns is not None:
         passed_ns = (other.time_of_day_ns - one.time_of_day_ns) % DAY_NS
-    if not 0 <= passed_ns <= JUDGED_NS:
+    if not 0 <= passed_ns <= judged_ns:
         return None
     speeds = [place.speed_m_s for place in (one, other) if place.speed_m_s is not None]
     reach = (max(speeds, default=FASTEST_M_S) + MARGIN_M_S) * passed_ns / 1e9

@@ -15,6 +15,7 @@ from typing import Any
 
 from level1.alarm import AlarmMachine
 from level1.board import ALWAYS, Board, Cell, Watch
+from level1.can_gnss import CanReceiver
 from level1.canopen import DEVICE_EMERGENCY, DEVICE_SILENT, NMT, Device, Devices
 from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Catalog, Command, Message, Repair
 from level1.command import Order
@@ -32,6 +33,7 @@ from level1.expression import (
 from level1.frame import Frame, frame_key
 from level1.freeze_frame import freeze_frame, physical
 from level1.gate import Gate, Refused
+from level1.health import Reading, raws
 from level1.holds import Holds
 from level1.memory import AlarmMemory, State
 from level1.repair import RepairMachine
@@ -60,14 +62,15 @@ class Supervisor:
     devices: CANopen devices known beforehand; others are learned when they are heard.
     monitor_ns: period of the monitoring messages, None for none. utc_offset_ns: UTC minus time line, None where no wall
     clock is known; it may be set at any time, as may utc_trusted. restored: the state stored at the end of an earlier boot.
-    readings: UCS messages whose values are given to `publish`.
+    readings: UCS messages whose values are given to `publish`. gnss_bus: index of the bus on which the unit's GNSS receiver
+    speaks, None: on none.
     """
 
     def __init__(self, catalog: Catalog, *, unit: str, boot: int = 1, seq: int = 0, armed: Collection[str] | None = None,
                  broadcast: bool = True, start_ns: int | None = None, monitor_ns: int | None = None,
                  utc_offset_ns: int | None = None, utc_trusted: bool = False, restored: State | None = None,
                  j1939: Mapping[int, int] | None = None, devices: Iterable[Device] = (),
-                 readings: Collection[str] = ()):
+                 readings: Collection[str] = (), gnss_bus: int | None = None):
         self.catalog = catalog
         self.unit = unit
         self.boot = boot
@@ -95,6 +98,7 @@ class Supervisor:
         self._repairs: dict[str, RepairMachine] = {}
         self._devices = Devices(catalog, devices, self, self.timers, self.counters, asks=broadcast) \
             if DEVICE_EMERGENCY in self._alarms or DEVICE_SILENT in self._alarms else None
+        self._receiver = None if gnss_bus is None else CanReceiver(gnss_bus, self.timers, self._hear, lambda: self.utc_offset_ns)
         self._compile(j1939 or {})
         self._broadcasts = self._make_broadcasts() if broadcast else {}
         self._samplers = self._make_samplers(monitor_ns) if monitor_ns else []
@@ -311,6 +315,8 @@ class Supervisor:
         self.subsystems.start(start)
         if self._devices is not None:
             self._devices.start(start)
+        if self._receiver is not None:
+            self._receiver.start(start)
         cyclic: list[Timed] = [*self._broadcasts.values(), *self._samplers]
         for timed in cyclic:
             self.timers.set(timed, start)
@@ -349,6 +355,9 @@ class Supervisor:
         if self._devices is not None:
             for can_id, listener in self._devices.listeners().items():
                 board.listen_to(can_id, listener)
+        if self._receiver is not None:
+            for pgn, listener in self._receiver.listeners().items():
+                board.listen(pgn, listener)
         board.compile()
 
     def _expressions(self) -> Iterable[Expression]:
@@ -433,6 +442,12 @@ class Supervisor:
             self.counters["frames refused by the gate"] += 1
         else:
             self._out.append(send)
+
+    def _hear(self, reading: Reading) -> None:
+        """What a receiver on a bus says, as if the UCS had said it: on the board, and on no bus again."""
+        page = self.board.pages.get(reading.message)
+        if page is not None:
+            page.receive(reading.t_ns, encode(page.message, raws(page.message, reading.values)))
 
     def tell(self, t_ns: int, message: str, values: dict[str, Any]) -> None:
         """A monitoring message of what a subsystem has been asked for."""

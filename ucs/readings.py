@@ -37,7 +37,7 @@ def messages(settings: Config, catalog: Catalog) -> frozenset[str]:
     found = readings_of(catalog, GNSS_MESSAGES.values())
     if missing := sorted(set(GNSS_MESSAGES.values()) - found):
         raise ConfigError(f'{settings.path}: gnss: no definition of {", ".join(missing)}; add "ucs.dbc" to the dbc of a [[bus]]')
-    return names | found
+    return names if settings.gnss.bus else names | found
 
 
 def quiet(settings: Config) -> frozenset[str]:
@@ -61,7 +61,7 @@ def start(settings: Config, catalog: Catalog, ports: Sequence[Port], journal: Jo
 
 
 def _gnss(settings: Config, inbox: Inbox, stack: ExitStack) -> GnssReceiver | None:
-    if settings.gnss is None:
+    if settings.gnss is None or not settings.gnss.port:
         return None
     # Not on the path of a unit without one: it costs 5 MB.
     from level1.io.gnss import GnssReceiver

@@ -120,7 +120,8 @@ def _supervisor(settings: Config, catalog: Catalog, journal: Journal, own: froze
     """The supervisor of this boot, with the latches and budgets of the last one."""
     return Supervisor(catalog, unit=settings.unit.name, boot=journal.boot, armed=settings.repairs.armed,
                       start_ns=time.monotonic_ns(), j1939=settings.j1939, restored=_restored(journal),
-                      monitor_ns=settings.bridge.period_ns if settings.bridge else None, readings=own, devices=known)
+                      monitor_ns=settings.bridge.period_ns if settings.bridge else None, readings=own, devices=known,
+                      gnss_bus=settings.gnss_bus)
 
 
 def _restored(journal: Journal) -> State | None:
@@ -167,7 +168,8 @@ def _start_lines(settings: Config, catalog: Catalog) -> Iterator[str]:
     passive = [name for name in repairable if name not in settings.repairs.armed]
     yield f"  {len(catalog.alarms)} alarms; repairs armed: {', '.join(armed) or 'none'}; passive: {', '.join(passive) or 'none'}"
     if settings.gnss:
-        yield f"  gnss {settings.gnss.port}, {settings.gnss.baud} bit/s"
+        gnss = settings.gnss
+        yield f"  gnss on bus {gnss.bus}" if gnss.bus else f"  gnss {gnss.port}, {gnss.baud} bit/s"
     if settings.recorder:
         yield f"  traffic recorded in {settings.recorder.path}, at most {settings.recorder.max_mb} MB"
 

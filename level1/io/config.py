@@ -83,11 +83,13 @@ class Bus(msgspec.Struct, frozen=True):
 
 class Gnss(msgspec.Struct, frozen=True):
     """A GNSS receiver. port: of a serial line, best by its id (`/dev/serial/by-id/…`: others change at replugging), or an address
-    on Ethernet, `socket://host:port`. baud in bit/s (NMEA 0183's own rate is 4800). broadcast: send what it says on the buses."""
+    on Ethernet, `socket://host:port`. baud in bit/s (NMEA 0183's own rate is 4800). broadcast: send what it says on the buses.
+    bus, instead of a port: the name of the bus on which it speaks by J1939 or NMEA 2000."""
 
-    port: str
+    port: str = ""
     baud: int = 115200
     broadcast: bool = False
+    bus: str = ""
 
 
 class Recording(msgspec.Struct, frozen=True):
@@ -147,6 +149,11 @@ class Config(msgspec.Struct, frozen=True):
     def j1939(self) -> dict[int, int]:
         """Index of each bus on which the UCS claims a J1939 address -> that address."""
         return {index: bus.j1939 for index, bus in enumerate(self.bus) if bus.j1939 is not None}
+
+    @property
+    def gnss_bus(self) -> int | None:
+        """Index of the bus on which the GNSS receiver speaks, None: on none."""
+        return self.bus_names.index(self.gnss.bus) if self.gnss is not None and self.gnss.bus else None
 
     @property
     def bus_names(self) -> tuple[str, ...]:
@@ -285,6 +292,8 @@ def _rule_problems(table: Mapping[str, Any]) -> Iterator[str]:
     if (isinstance(period, str) and not list(_duration_problems(period, ""))
             and not SHORTEST_PERIOD_NS <= duration_ns(period) <= LONGEST_PERIOD_NS):
         yield f'bridge.period: "{period}" is outside 10 ms to 1 min'
+    if "gnss" in table:
+        yield from _gnss_problems(gnss, table.get("bus"))
     baud = gnss.get("baud")
     if isinstance(baud, int) and not 1200 <= baud <= 4_000_000:
         yield f"gnss.baud: {baud} is outside 1200 to 4000000 bit/s"
@@ -295,6 +304,16 @@ def _rule_problems(table: Mapping[str, Any]) -> Iterator[str]:
     if (isinstance(period, str) and not list(_duration_problems(period, ""))
             and not FASTEST_HEALTH_NS <= duration_ns(period) <= SLOWEST_HEALTH_NS):
         yield f'health.period: "{period}" is outside 100 ms to 1 s'
+
+
+def _gnss_problems(gnss: Mapping[str, Any], buses: Any) -> Iterator[str]:
+    """Where a receiver speaks: on a line or on a bus of this unit."""
+    name = gnss.get("bus")
+    if bool(gnss.get("port")) == bool(name):
+        yield 'gnss: a receiver speaks on a serial line or on a bus; give port = "/dev/…" or bus = "…"'
+    names = [str(bus["name"]) for bus in buses if isinstance(bus, Mapping) and "name" in bus] if isinstance(buses, list) else []
+    if isinstance(name, str) and name and name not in names:
+        yield f'gnss.bus: no bus is called "{name}"{did_you_mean(name, names)}'
 
 
 def _bus_problems(buses: Any) -> Iterator[str]:

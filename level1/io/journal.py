@@ -127,7 +127,8 @@ class Journal:
         with self._changed:
             trouble = self._trouble or ("the disk is slow" if self._slow else "")
             if not trouble and not self._ballast.held:
-                trouble = "the disk is full but for the reserve for alarms, which is in use; delete files on that disk"
+                trouble = "the disk is full but for the reserve for alarms, which is in use; delete files on that disk" \
+                    if self.path.exists() else "its file is gone; put its disk back"
             if not trouble:
                 return None
             waiting = f"; {len(self._queue)} events wait in memory" if self._queue else ""

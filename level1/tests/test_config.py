@@ -94,6 +94,8 @@ def test_paths_count_from_the_folder_of_the_file(tmp_path: Path) -> None:
     ('channel = "can0"', 'chanel = "can0"', 'bus[0].chanel: unknown key; did you mean "channel"?'),
     ("[repairs]", "[repair]", 'repair: unknown key; did you mean "repairs"?'),
     ('channel = "can0"', "channel = 0", "bus[0].channel: expected a text, found a whole number (0)"),
+    ('port = "/dev/ttyUSB0"', "", 'gnss: a receiver speaks on a serial line or on a bus; give port = "/dev/…" or bus = "…"'),
+    ('port = "/dev/ttyUSB0"', 'bus = "implemnt"', 'gnss.bus: no bus is called "implemnt"; did you mean "implement"?'),
     ("baud = 115200", 'baud = "fast"', "gnss.baud: expected a whole number, found a text ('fast')"),
     ("baud = 115200", "baud = true", "gnss.baud: expected a whole number, found true or false (True)"),
     ("baud = 115200", "baud = 1", "gnss.baud: 1 is outside 1200 to 4000000 bit/s"),

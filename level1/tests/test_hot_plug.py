@@ -1,13 +1,15 @@
 """Implements that come and go while the supervision runs: one configuration, absent on purpose is no fault, lost is one."""
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import pytest
 
 from level1.catalog import Catalog
 from level1.command import Order
 from level1.decode import encode
 from level1.definitions import Source, build
-from level1.event import Event, Result
+from level1.event import Event, Output, Result
 from level1.frame import Frame, frame_key
 from level1.memory import State
 from level1.supervisor import Supervisor
@@ -177,6 +179,48 @@ def test_a_restart_forgets_what_was_said_and_waits_to_hear_the_implement(catalog
     assert again.until(100) == []
     again.coupled["Drill"] = 3
     assert again.until(110) == [(100.0, "DrillEmpty", "raised")]
+
+
+CLAIMING = Source("spreader.dbc", """VERSION ""
+NS_ :
+BS_:
+BU_: UCS SPREADER
+BO_ 2565799818 SPREADER_CLAIM: 8 SPREADER
+ SG_ SpreaderFunction : 40|8@1+ (1,0) [0|250] "" UCS
+BO_ 800 SPREADER_STATUS: 1 SPREADER
+ SG_ SpreaderLevel : 0|8@1+ (0.5,0) [0|100] "%" UCS
+BO_ 801 SPREADER_ALARMS: 1 UCS
+ SG_ SpreaderSilent : 0|2@1+ (1,0) [0|3] "" SPREADER
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";
+BA_DEF_ SG_ "AlarmCode" INT 0 65535;
+BA_DEF_ SG_ "AlarmWhen" STRING;
+BA_DEF_ SG_ "AlarmEnabledWhen" STRING;
+BA_ "VFrameFormat" BO_ 2565799818 3;
+BA_ "GenMsgCycleTime" BO_ 800 100;
+BA_ "GenMsgCycleTime" BO_ 801 1000;
+BA_ "AlarmCode" SG_ 801 SpreaderSilent 900;
+BA_ "AlarmWhen" SG_ 801 SpreaderSilent "never(SPREADER_STATUS) or silent(SPREADER_STATUS, 1 s)";
+BA_ "AlarmEnabledWhen" SG_ 801 SpreaderSilent "SpreaderFunction == Spreader";
+VAL_ 2565799818 SpreaderFunction 130 "Spreader" ;
+""")
+"""A device that claims source address 0x8A; its alarms are armed by the function in its NAME (ISO 11783-5)."""
+
+
+def test_an_implement_arms_its_alarms_when_it_claims_its_name() -> None:
+    found, problems = build([CLAIMING])
+    assert not problems and found is not None
+    supervisor = Supervisor(found, unit="a", start_ns=0, broadcast=False, j1939={0: 0x80})
+
+    def alarms(outputs: Sequence[Output]) -> list[str]:
+        return [f"{output.alarm} {output.event}" for output in outputs if isinstance(output, Event)]
+    other, spreader = (Frame(10 * S, frame_key(0x18EEFF00 | source, True), bytes([1, 0, 0, 0, 0, function, 0, 0xA0]))
+                       for source, function in ((0x8B, 130), (0x8A, 130)))
+    assert alarms(supervisor.receive(other)) == []
+    assert alarms(supervisor.receive(spreader)) == ["SpreaderSilent raised"], "it claims, and says nothing"
+    status = Frame(11 * S, frame_key(800, False), b"\x20")
+    assert alarms(supervisor.receive(status)) == ["SpreaderSilent cleared"]
+    assert alarms(supervisor.tick(13 * S)) == ["SpreaderSilent raised"]
 
 
 def test_a_sensor_of_the_coupling_needs_no_order() -> None:
