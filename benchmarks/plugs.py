@@ -246,7 +246,8 @@ def pull(count: int, dice: random.Random, folder: Path, progress: Callable[[str]
     events = list(read_events(folder / "disk" / "journal.db", limit=10**6))
     problems = [f"`ucs run` ended with {code}"] * (code != 0)
     for socket in sockets:
-        told = [event for event in events if event.alarm == socket.alarm and socket.is_its(event)]
+        told = [event for event in events if event.event in ("raised", "cleared")  # a repair only says what it would do
+                and event.alarm == socket.alarm and socket.is_its(event)]
         problems += _misjudged_on_a_bus(socket, pulls, told) if socket.bus else _misjudged(socket, pulls, told)
     ends = said.getvalue()
     not_sent, not_recorded = _unsent(events), _unrecorded(events)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from level1.event import Event, Monitor
@@ -155,6 +155,7 @@ def test_a_wall_clock_that_disagrees_with_its_time_is_told_and_one_without_a_pos
         assert [(round(t_s), *rest) for t_s, *rest in outputs] == expected
 
 
+@settings(deadline=None, max_examples=30)
 @given(st.lists(st.tuples(st.sampled_from([POSITION, MOTION, TIME, RAPID_POSITION, RAPID_MOTION]), st.binary(max_size=9)),
                 max_size=30))
 def test_whatever_it_says_nothing_breaks(said: list[tuple[int, bytes]]) -> None:

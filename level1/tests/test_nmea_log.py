@@ -4,7 +4,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from level1.io.definitions import load
@@ -62,6 +62,7 @@ def test_what_holds_no_right_sentence_of_a_position_is_none(tmp_path: Path, cont
         Log(path)
 
 
+@settings(deadline=None, max_examples=50)
 @given(st.lists(st.one_of(st.binary(max_size=40), st.builds(fix, st.from_regex(r"[0-9]{6}(\\.[0-9]{1,9})?", fullmatch=True)),
                           st.just(sentence(NOTHING)), st.just(b"\n")), max_size=30))
 def test_whatever_a_file_holds_its_time_goes_on(parts: list[bytes]) -> None:
