@@ -111,6 +111,7 @@ class MqttConnection:
         self.address = address
         self.ready = False
         self.lost = ""
+        self._accepted = False
         self._subscribe = list(subscribe)
         self._received: list[Received] = []
         self._last: paho.MQTTMessageInfo | None = None
@@ -205,9 +206,17 @@ class MqttConnection:
 
     def _check(self, result: MQTTErrorCode) -> None:
         if result not in (MQTTErrorCode.MQTT_ERR_SUCCESS, MQTTErrorCode.MQTT_ERR_QUEUE_SIZE, MQTTErrorCode.MQTT_ERR_AGAIN):
-            self.lost = self.lost or paho.error_string(result).rstrip(".").lower()
+            self._lose(paho.error_string(result).rstrip(".").lower())
+
+    def _lose(self, why: str) -> None:
+        """It is over. In TLS 1.3 a certificate that the broker does not want shows in nothing else than this."""
+        if self.address.tls and not self._accepted:
+            why = ("the broker ended the connection before it answered; see that our certificate is of its authority, still valid "
+                   "and not revoked")
+        self.lost = self.lost or why
 
     def _on_connect(self, client: Any, data: Any, flags: Any, reason: Any, properties: Any) -> None:
+        self._accepted = True
         if reason.is_failure:
             self.lost = f"the broker refuses us: {reason}"
         elif self._subscribe:
@@ -222,7 +231,7 @@ class MqttConnection:
         self.ready = not refused
 
     def _on_disconnect(self, client: Any, data: Any, flags: Any, reason: Any, properties: Any) -> None:
-        self.lost = self.lost or f"the connection broke ({reason})"
+        self._lose(f"the connection broke ({reason})")
 
     def _on_message(self, client: Any, data: Any, message: paho.MQTTMessage) -> None:
         try:

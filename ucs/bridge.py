@@ -5,7 +5,6 @@ import argparse
 import os
 import signal
 import socket
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from level1.io.config import Config, ConfigError, load
 from level1.io.inquiry import Desk
 from level1.io.systemd import Supervised
+from ucs.printer import Printer
 from ucs.standing import BRIDGE, BridgeStanding, encode
 from ucs.version import version
 
@@ -58,10 +58,15 @@ def run(args: argparse.Namespace) -> int:
         return _make_site(args)
     if args.unit is None:
         raise ConfigError("give the path of a unit.toml (see ucs bridge --help)")
-    from bridge.session import Bridge
     settings = settings_of(load(args.unit))
     service = Supervised()
-    witness = Witness(str(settings.broker), time.monotonic_ns, service)
+    with Printer() as printer:
+        _serve(settings, service, Witness(str(settings.broker), time.monotonic_ns, service, printer.err))
+    return 0
+
+
+def _serve(settings: Settings, service: Supervised, witness: Witness) -> None:
+    from bridge.session import Bridge
     bridge = Bridge(settings, witness.say, turned=lambda: witness.turned(bridge.online, bridge.counters))
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: bridge.stop())
@@ -69,14 +74,13 @@ def run(args: argparse.Namespace) -> int:
         service.ready(f"carrying {settings.unit} to {settings.broker}")
         bridge.run()
         service.stopping()
-    return 0
 
 
 class Witness:
     """What a bridge has said and done lately, for those who ask. Told by the bridge's thread, asked by another."""
 
-    def __init__(self, broker: str, clock: Callable[[], int], service: Supervised):
-        self._broker, self._clock, self._service = broker, clock, service
+    def __init__(self, broker: str, clock: Callable[[], int], service: Supervised, told: Callable[[str], None]):
+        self._broker, self._clock, self._service, self._told = broker, clock, service, told
         self._begun_ns = self._turned_ns = self._changed_ns = clock()
         self._ack_ns: int | None = None
         self._online = False
@@ -86,7 +90,7 @@ class Witness:
     def say(self, line: str) -> None:
         """A line about what happens."""
         self._said = line
-        print(f"ucs bridge: {line}", file=sys.stderr, flush=True)
+        self._told(f"ucs bridge: {line}")
 
     def turned(self, online: bool, counters: Counter[str]) -> None:
         """The bridge has done a turn."""
@@ -118,7 +122,8 @@ def _make_site(args: argparse.Namespace) -> int:
     hosts = args.host or list(dict.fromkeys([socket.gethostname(), "localhost", "127.0.0.1"]))
     make_site(args.make_site, fleet, units, hosts)
     folder = args.make_site.absolute()
-    print(f"site of {fleet} in {folder}; start its broker:\n\n  mosquitto -c {folder}/mosquitto.conf\n")
+    print(f"site of {fleet} in {folder}; start its broker:\n\n  mosquitto -c {folder}/mosquitto.conf\n\n"
+          f"or NATS:\n\n  nats-server -c {folder}/nats.conf\n")
     for unit in units:
         print(f"{unit}: in its unit.toml\n\n  [bridge]\n  broker = \"mqtts://{hosts[0]}:8883\"\n  ca = \"{folder}/ca.pem\"\n"
               f"  certificate = \"{folder}/{unit}.pem\"\n  key = \"{folder}/{unit}-key.pem\"\n")

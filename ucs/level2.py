@@ -3,17 +3,19 @@ from __future__ import annotations
 
 import argparse
 import signal
-import sys
 from contextlib import ExitStack
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 from level1.io.error import OutsideError
+from ucs.printer import Printer
 
 LISTEN = "127.0.0.1:1883"
 FLEET = "fleet"
 """As in a unit.toml that names none."""
+TLS = {"--ca": "who signed the broker's certificate", "--certificate": "our certificate",
+       "--key": "the certificate's private key"}
 DESCRIPTION = """\
 Receives what the units of a fleet send, stores every event exactly once in its own SQLite file, and only then acknowledges
 it. Prints one line for each event; connections, silent units and gaps are told on the error output.
@@ -42,9 +44,8 @@ def add_parser(subparsers: Any) -> None:
     where.add_argument("--broker", metavar="URL", help="use this broker: mqtt://host:1883 or mqtts://host:8883")
     parser.add_argument("--store", metavar="FILE", type=Path, default=Path("level2.db"), help="where events are kept (%(default)s)")
     parser.add_argument("--fleet", metavar="NAME", help="receive this fleet only (default: all)")
-    parser.add_argument("--ca", metavar="PEM", help="who signed the broker's certificate")
-    parser.add_argument("--certificate", metavar="PEM", help="our certificate")
-    parser.add_argument("--key", metavar="PEM", help="the certificate's private key")
+    for option, help in TLS.items():
+        parser.add_argument(option, metavar="PEM", help=help)
     command = parser.add_subparsers(dest="action", metavar="command").add_parser(
         "command", help="send a signed command to a unit", description=COMMAND, epilog=COMMAND_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -53,6 +54,8 @@ def add_parser(subparsers: Any) -> None:
     command.add_argument("target", metavar="ALARM", nargs="?", default="", help="which alarm, for acknowledge and reset")
     command.add_argument("--fleet", metavar="NAME", default=argparse.SUPPRESS, help="the unit's fleet (default: fleet)")
     command.add_argument("--broker", metavar="URL", default=argparse.SUPPRESS, help=f"the broker (default: mqtt://{LISTEN})")
+    for option, help in TLS.items():
+        command.add_argument(option, metavar="PEM", default=argparse.SUPPRESS, help=help)
     command.add_argument("--value", metavar="NUMBER", help="for a command that takes one, such as reduce_speed")
     command.add_argument("--sign", metavar="KEY", type=Path, required=True, help="private key made by `ucs keys make`")
     command.add_argument("--name", metavar="NAME", dest="signer", help="the key's name at the unit (default: the file's)")
@@ -67,7 +70,7 @@ def _command(args: argparse.Namespace) -> int:
     """Send a command; 0 when it was obeyed, 1 when it was refused."""
     from bridge.keys import load_private
     from bridge.mqtt import Tls, parse_address
-    from bridge.wire import WireError
+    from bridge.wire import WireError, shown
     from level2.commander import Commander, Signer, Wish, counter_beside
     signer = Signer(args.signer or args.sign.stem, load_private(args.sign), counter_beside(args.sign))
     wish = Wish(args.unit, args.name, args.target, _number(args.value))
@@ -80,7 +83,7 @@ def _command(args: argparse.Namespace) -> int:
         result = commander.run()
     finally:
         commander.close()
-    print(f"{args.unit}: {args.name} {result.outcome}" + (f": {result.reason}" if result.reason else ""))
+    print(shown(f"{args.unit}: {args.name} {result.outcome}" + (f": {result.reason}" if result.reason else "")))
     return 0 if result.outcome == "done" else 1
 
 
@@ -95,20 +98,23 @@ def _receive(args: argparse.Namespace) -> int:
     """Receive until SIGINT or SIGTERM."""
     from bridge.broker import EmbeddedBroker
     from bridge.mqtt import Tls, parse_address
+    from bridge.wire import shown
     from level2.receiver import EVERY_FLEET, Receiver, Settings, event_line
     from level2.store import Store
     with ExitStack() as stack:
+        printer = stack.enter_context(Printer())  # whoever reads our lines must not hold up acknowledgements
         store = stack.enter_context(Store(args.store))
         if args.broker:
             address = parse_address(args.broker)
         else:
             address = stack.enter_context(EmbeddedBroker(*_host_and_port(args.listen or LISTEN))).address
-            _say(f"embedded broker on {address}, for this machine only")
+            printer.err(f"ucs level2: embedded broker on {address}, for this machine only")
         settings = Settings(address, args.fleet or EVERY_FLEET, Tls(args.ca, args.certificate, args.key))
-        receiver = Receiver(settings, store, told=lambda arrival: print(event_line(arrival), flush=True), say=_say)
+        receiver = Receiver(settings, store, told=lambda arrival: printer.out(event_line(arrival)),
+                            say=lambda line: printer.err(shown(f"ucs level2: {line}")))
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: receiver.stop())
-        _say(f"receiving {'all fleets' if not args.fleet else args.fleet} from {address} into {args.store}")
+        printer.err(f"ucs level2: receiving {args.fleet or 'all fleets'} from {address} into {args.store}")
         receiver.run()
     return 0
 
@@ -118,7 +124,3 @@ def _host_and_port(text: str) -> tuple[str, int]:
     if not colon or not port.isdigit() or int(port) > 65535:
         raise OutsideError(f'--listen "{text}": write HOST:PORT, such as {LISTEN}')
     return host.strip("[]"), int(port)
-
-
-def _say(line: str) -> None:
-    print(f"ucs level2: {line}", file=sys.stderr, flush=True)

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from level1.canopen import Device
-from level1.catalog import Catalog
+from level1.catalog import LOCKED_OUT, Catalog
 from level1.event import Event
 from level1.io import config, definitions
 from level1.io.can import Port
@@ -21,10 +21,10 @@ from level1.io.canopen import HistoryReader, devices
 from level1.io.config import Config
 from level1.io.error import OutsideError
 from level1.io.inbox import Inbox
-from level1.io.journal import Journal
+from level1.io.journal import FIRST, Journal, Reader
 from level1.io.live import Live, decode_state
 from level1.io.systemd import Supervised
-from level1.memory import State
+from level1.memory import AlarmMemory, State
 from level1.supervisor import Supervisor
 from ucs import readings
 from ucs.attendant import Attendant
@@ -127,12 +127,25 @@ def _supervisor(settings: Config, catalog: Catalog, journal: Journal, own: froze
 def _restored(journal: Journal) -> State | None:
     stored = journal.restored_state()
     if stored is None:
-        return None
+        with Reader(journal.path) as reader:
+            return lock_outs(reader)
     try:
         return decode_state(stored)
     except msgspec.DecodeError as error:
         raise OutsideError(f"journal {journal.path}: its latches and lock-outs can't be read ({error}); see to what was locked "
                            "out, then set another [journal] path") from None
+
+
+def lock_outs(reader: Reader) -> State | None:
+    """What is locked out by the events alone: where a damaged journal gave back events and no state, no valve may open for that."""
+    last: dict[str, Event] = {}
+    after = FIRST
+    while events := reader.events(after):
+        after = (events[-1].boot, events[-1].seq)
+        last |= {event.alarm: event for event in events if event.event in ("locked_out", "cleared")}
+    found = tuple(AlarmMemory(event.alarm, LOCKED_OUT, event.instance, False, event.attempt, (), ())
+                  for event in last.values() if event.event == "locked_out")
+    return State("running", found) if found else None
 
 
 def _teller(printer: Printer, histories: HistoryReader) -> Callable[[Event], None]:

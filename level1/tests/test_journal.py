@@ -212,7 +212,8 @@ def truncate(path: Path) -> None:
     os.truncate(path, path.stat().st_size - 5000)
 
 
-@pytest.mark.fault("journal corrupt at the start", "kept aside; what stands on sound pages is saved into a new one; boot ids go on")
+@pytest.mark.fault("journal corrupt at the start",
+                   "kept aside; what stands on sound pages is saved into a new one; boot ids and lock-outs stay")
 @pytest.mark.parametrize("damage", [damage_header, damage_middle, truncate])
 def test_a_corrupt_journal_is_kept_aside_and_a_new_one_begun(path: Path, damage: Callable[[Path], None]) -> None:
     with Journal(path, "tractor-7") as journal:

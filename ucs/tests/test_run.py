@@ -12,10 +12,14 @@ from pathlib import Path
 import can
 import pytest
 
+from level1.catalog import LOCKED_OUT
 from level1.decode import encode
+from level1.event import Event, seconds
 from level1.io.definitions import load
-from level1.io.journal import read_events
+from level1.io.journal import Journal, Reader, read_events
+from level1.supervisor import Supervisor
 from ucs.main import main
+from ucs.run import lock_outs
 
 UNIT = """
 [unit]
@@ -138,3 +142,20 @@ def test_every_obstacle_is_one_line(
     assert main(["run", str(unit)]) == code
     captured = capsys.readouterr()
     assert error in captured.err.splitlines()[0] and "Traceback" not in captured.err and captured.out == ""
+
+
+@pytest.mark.fault("journal corrupt at the start")
+def test_a_lock_out_survives_a_journal_of_which_only_events_could_be_saved(tmp_path: Path) -> None:
+    path = tmp_path / "journal.db"
+    with Journal(path, "tractor-7") as journal:
+        journal.append([Event("tractor-7", 1, seq, seconds(seq), None, False, alarm, 3101, "High", word, 1, 3, {}, "")
+                        for seq, (alarm, word) in enumerate([("Igniter", "locked_out"), ("PilotFlameOut", "locked_out"),
+                                                             ("Igniter", "cleared")], 1)], b"{}")
+    path.write_bytes(b"not a database at all" + path.read_bytes()[21:])
+    with Journal(path, "tractor-7") as journal, Reader(path) as reader:
+        assert journal.restored_state() is None
+        state = lock_outs(reader)
+        supervisor = Supervisor(load(["flaming_tool.dbc"]), unit="tractor-7", boot=2, start_ns=0, restored=state)
+        supervisor.tick(1)
+    assert supervisor.alarm_states()["PilotFlameOut"] == LOCKED_OUT
+    assert [memory.name for memory in state.alarms] == ["PilotFlameOut"] if state else False
