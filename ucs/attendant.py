@@ -54,6 +54,7 @@ class Attendant:
         self._turned_ns = self._begun_ns = clock()
         self._lateness: deque[int] = deque([0, 0], maxlen=2)
         self._lateness_ns = self._begun_ns
+        self._begun = False
         self._raised_ns: dict[int, int] = {}
         self._story: dict[int, str] = {}
         self._wanted, self._given = threading.Event(), threading.Event()
@@ -87,7 +88,9 @@ class Attendant:
         if self._turned_ns - self._lateness_ns >= LATENESS_NS:
             self._lateness_ns = self._turned_ns
             self._lateness.append(0)
-        self._lateness[-1] = max(self._lateness[-1], lateness_ns)
+        if self._begun:  # the first turn is late by what the start took
+            self._lateness[-1] = max(self._lateness[-1], lateness_ns)
+        self._begun = True
         return () if self._house is None else self._house.take(lateness_ns, dropped)
 
     def _remember(self, event: Event, now_ns: int) -> None:

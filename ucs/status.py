@@ -116,6 +116,9 @@ def run(args: argparse.Namespace) -> int:
     except OutsideError as error:
         print(f"UCS UNKNOWN - {error.problems[0]}", *error.problems[1:], sep="\n")
         return UNKNOWN
+    except OSError as error:
+        print(f"UCS UNKNOWN - {error.filename}: {error.strerror}")
+        return UNKNOWN
     findings = judge(picture, Limits(args.critical, args.waiting, args.disk))
     level = max((finding.level for finding in findings), key=RANKS.index, default=OK)
     if args.json:
@@ -167,6 +170,8 @@ def _journal(path: Path, has_bridge: bool, running: bool) -> JournalStanding:
                                    newest_utc=newest[0].utc if newest else None, alarms=alarms)
     except JournalError as error:
         return JournalStanding(str(path), fault=error.problems[0])
+    except OSError as error:
+        return JournalStanding(str(path), fault=f"journal {path}: can't be read ({error.strerror})")
 
 
 def _waiting(reader: Any, path: Path) -> tuple[int, float | None]:
@@ -315,9 +320,9 @@ def page(picture: Picture, findings: Sequence[Finding]) -> Iterator[str]:
         yield _row("run", picture.run_silent + (f"; last boot {journal.boot}" if journal.boot else ""))
     alarms = run.alarms if run else journal.alarms
     if not alarms and (run or not journal.fault):
-        yield _row("alarms", f"none of {run.defined}" if run else "none when it ended")
+        yield _row("alarms", f"none of {run.defined}" if run else "none as last stored")
     for index, alarm in enumerate(alarms):
-        yield _row("alarms" if index == 0 else "", alarm_line(alarm) + ("" if run else " (when it ended)"))
+        yield _row("alarms" if index == 0 else "", alarm_line(alarm) + ("" if run else " (as last stored)"))
     if run:
         yield _row("repairs", f"armed: {', '.join(run.armed) or 'none'}; passive: {', '.join(run.passive) or 'none'}")
     yield _row("journal", _journal_line(picture))
