@@ -180,6 +180,7 @@ def _repair(repair: RepairMachine, now_ns: int, armed: bool) -> RepairStanding:
     position = min(repair.position, len(definition.steps) - 1)
     return RepairStanding(
         phase=PHASES[repair.phase] if armed else "passive", attempt=repair.attempt, attempts=definition.attempts,
+        used=sum(begun_ns > now_ns - definition.window_ns for begun_ns in repair.begun_ns),
         step=position + 1 if running else 0, steps=len(definition.steps),
         doing=texts[position] if running and len(texts) == len(definition.steps) else "",
         left_s=None if repair.due >= FAR else max(0.0, (repair.due - now_ns) / 1e9), obstacle=repair.obstacle())

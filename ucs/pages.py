@@ -144,7 +144,7 @@ def _name(alarm: AlarmStanding) -> str:
 
 def _repair(repair: RepairStanding) -> Line:
     left = f", {repair.left_s:.1f} s left" if repair.left_s is not None else ""
-    attempt = f"attempt {repair.attempt} of {repair.attempts}"
+    attempt = repair.attempt_text
     match repair.phase:
         case "running":
             doing = f": {repair.doing}" if repair.doing else ""

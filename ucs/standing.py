@@ -15,18 +15,28 @@ from level1.io.inquiry import Silence, ask
 class RepairStanding(msgspec.Struct, frozen=True):
     """A repair under way or given up.
 
-    phase: idle, running, pausing, waiting (something is in the way: `obstacle`), settling, or passive (not armed). step, steps:
-    which of how many, from 1. left_s: of the present wait, expectation or pause; None: nothing runs out.
+    phase: idle, running, pausing, waiting (something is in the way: `obstacle`), settling, or passive (not armed). attempt: of this
+    activation; used, attempts: of the budget, which earlier activations use up too. step, steps: which of how many, from 1.
+    left_s: of the present wait, expectation or pause; None: nothing runs out.
     """
 
     phase: str
     attempt: int
+    used: int
     attempts: int
     step: int = 0
     steps: int = 0
     doing: str = ""
     left_s: float | None = None
     obstacle: str = ""
+
+
+    @property
+    def attempt_text(self) -> str:
+        """Which attempt of how many."""
+        if self.used == self.attempt:
+            return f"attempt {self.attempt} of {self.attempts}"
+        return f"attempt {self.attempt} ({self.used} of {self.attempts} of the budget used)"
 
 
 class AlarmStanding(msgspec.Struct, frozen=True):

@@ -356,7 +356,7 @@ def _doing(alarm: AlarmStanding) -> str:
         return ", its repair is not armed"
     left = f", {roughly(repair.left_s)} left" if repair.left_s is not None else ""
     doing = {"running": f": {repair.doing}", "pausing": ": pauses", "waiting": f": waits, {repair.obstacle}"}.get(repair.phase, "")
-    return f", attempt {repair.attempt} of {repair.attempts}{doing}{left}" if repair.attempt or repair.phase != "idle" else ""
+    return f", {repair.attempt_text}{doing}{left}" if repair.attempt or repair.phase != "idle" else ""
 
 
 def _bus_line(bus: BusStanding) -> str:

@@ -167,7 +167,7 @@ def test_what_can_send_is_not_within_its_reach() -> None:
 def sight(catalog: Catalog) -> Sight:
     found = watching(catalog, 1000, 1000)
     alarm = AlarmStanding("PilotFlameOut", 3101, "High", "Repairing", "out \x1b[2J\n by wind", age_s=4.0,
-                          repair=RepairStanding("running", 2, 3, 2, 7, "wait 30 s", 12.4))
+                          repair=RepairStanding("running", 2, 2, 3, 2, 7, "wait 30 s", 12.4))
     bus = BusStanding("implement", "socketcan", "can0", "BusOff", 100, 3, quiet_s=4.0, counters={"lost": 2})
     many = [msgspec.structs.replace(alarm, name=f"Alarm{n}", priority="Low", state="Active", repair=None) for n in range(30)]
     return Sight("tractor-7 of fleet", "supervised for 1 s", [alarm, *many], list(found.messages(1000 * MS)), [bus],

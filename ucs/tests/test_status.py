@@ -112,11 +112,12 @@ def test_the_first_line_holds_no_bar_that_a_plugin_would_cut_at() -> None:
 
 
 @pytest.mark.parametrize(("repair", "text"), [
-    (RepairStanding("running", 2, 3, 2, 7, "wait 30 s", 12.4), ", attempt 2 of 3: wait 30 s, 12 s left"),
-    (RepairStanding("pausing", 1, 3, left_s=5.0), ", attempt 1 of 3: pauses, 5.0 s left"),
-    (RepairStanding("waiting", 0, 3, obstacle="paused from above"), ", attempt 0 of 3: waits, paused from above"),
-    (RepairStanding("passive", 0, 3), ", its repair is not armed"),
-    (RepairStanding("idle", 0, 3), ""),
+    (RepairStanding("running", 2, 2, 3, 2, 7, "wait 30 s", 12.4), ", attempt 2 of 3: wait 30 s, 12 s left"),
+    (RepairStanding("pausing", 1, 1, 3, left_s=5.0), ", attempt 1 of 3: pauses, 5.0 s left"),
+    (RepairStanding("pausing", 1, 2, 3, left_s=5.0), ", attempt 1 (2 of 3 of the budget used): pauses, 5.0 s left"),
+    (RepairStanding("waiting", 0, 0, 3, obstacle="paused from above"), ", attempt 0 of 3: waits, paused from above"),
+    (RepairStanding("passive", 0, 0, 3), ", its repair is not armed"),
+    (RepairStanding("idle", 0, 0, 3), ""),
 ])
 def test_an_alarm_tells_what_is_done_about_it(repair: RepairStanding, text: str) -> None:
     line = alarm_line(msgspec.structs.replace(OUT, repair=repair))
