@@ -42,7 +42,7 @@ def sweep_html(alarm: str, attribute: str, rows: Sequence[tuple[str, Behaviour]]
     most = max((found.raised for _, found in rows), default=0) or 1
     bars = []
     for place, (value, found) in enumerate(rows):
-        y, width = 20 + ROW * place, 480 * found.raised / most
+        y, width = 20 + ROW * place, 400 * found.raised / most
         bars.append(f'<text x="{LABEL - 8}" y="{y + 14}" text-anchor="end" font-size="12">{escape(value)}</text>'
                     f'<rect x="{LABEL}" y="{y}" width="{max(width, 1):.1f}" height="18" rx="3" fill="{NEW}"/>'
                     f'<text x="{LABEL + width + 8:.1f}" y="{y + 14}" font-size="12">{found.raised} '

@@ -11,12 +11,14 @@ import hashlib
 import importlib
 import os
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import get_context
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, TextIO
 
 import msgspec
@@ -166,16 +168,21 @@ def _computed(jobs: Sequence[Job], todo: Sequence[int], workers: int | None,
             yield number, work(jobs[number])
         return
     with _executor(count, scheduler) as executor:
+        done: SimpleQueue[Future[Outcome]] = SimpleQueue()
         with _uninterrupted():
             futures: dict[Future[Outcome], int] = {executor.submit(work, jobs[number]): number for number in todo}
-        completed = as_completed if scheduler is None else _as_completed_on_cluster
-        for future in completed(futures):
-            yield futures[future], future.result()
-
-
-def _as_completed_on_cluster(futures: Mapping[Future[Outcome], int]) -> Iterator[Future[Outcome]]:
-    """Dask's futures are not those of the standard library's own `as_completed`: in their order, then."""
-    yield from futures
+            if scheduler is None:
+                for future in futures:
+                    future.add_done_callback(done.put)
+        for future in futures:
+            # Dask's futures come in their order; the others as they are done. (The standard library's `as_completed` holds the
+            # locks of all of them for a moment: Ctrl-C in it would leave them locked, and the pool could never be shut down.)
+            completed = done.get() if scheduler is None else future
+            try:
+                outcome = completed.result()
+            except BrokenProcessPool:
+                raise OutsideError("a process ended within its recording (out of memory?); --jobs 1 shows which") from None
+            yield futures[completed], outcome
 
 
 @contextmanager
@@ -188,8 +195,9 @@ def _executor(count: int, scheduler: str | None) -> Iterator[Executor]:
     try:
         yield executor
     except BaseException:
+        processes = list((executor._processes or {}).values())  # `shutdown` forgets them
         executor.shutdown(wait=False, cancel_futures=True)
-        for process in list((executor._processes or {}).values()):
+        for process in processes:
             process.terminate()
         raise
     executor.shutdown()
