@@ -64,7 +64,10 @@ def run(args: argparse.Namespace) -> int:
         raise OutsideError(f"--last {args.last}: write a number from 1")
     query = Query(args.alarm, args.event, _moment("--since", args.since), _moment("--until", args.until), args.boot)
     write = {"text": _text_writer(args.values), "jsonl": _write_json, "csv": _csv_writer()}[args.format]
-    with Reader(_journal_path(args.unit)) as reader:
+    path = _journal_path(args.unit)
+    if args.follow and not _await(path):
+        return 0
+    with Reader(path) as reader:
         listing = Listing(reader, query)
         found = listing.new()
         count = 0
@@ -138,6 +141,18 @@ class Listing:
 
 def _place(entry: Entry) -> tuple[int, int, bool]:
     return (entry.boot, entry.seq, False) if isinstance(entry, Event) else (entry.boot, entry.after, True)
+
+
+def _await(path: Path) -> bool:
+    """Wait for a journal that `ucs run` has not begun yet; False after Ctrl-C."""
+    try:
+        if not path.exists():
+            print(f"ucs journal: {path} is not there yet; waiting for `ucs run`", file=sys.stderr)
+        while not (path.exists() and path.stat().st_size):
+            time.sleep(POLL_S)
+        return True
+    except KeyboardInterrupt:
+        return False
 
 
 def _follow(reader: Reader, listing: Listing, write: Writer) -> None:

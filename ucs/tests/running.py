@@ -12,6 +12,23 @@ from ucs.main import main
 from ucs.standing import RunStanding, ask_run
 
 
+def unit_toml(channel: str) -> str:
+    """A unit with the flaming tool on a virtual bus, its pilot flame lit again."""
+    return f"""
+[unit]
+name = "tractor-7"
+[[bus]]
+name = "implement"
+interface = "virtual"
+channel = "{channel}"
+dbc = ["flaming_tool.dbc"]
+[repairs]
+armed = ["PilotFlameOut"]
+[journal]
+path = "journal.db"
+"""
+
+
 def beside_run(unit: Path, body: Callable[[Path], None]) -> None:
     """`ucs run` in this thread until the body, in another, is done; what the body raises is raised."""
     failed: list[BaseException] = []

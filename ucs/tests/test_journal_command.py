@@ -139,6 +139,17 @@ def test_commands_stand_among_the_events_with_what_was_sent(unit: Path, capsys: 
     assert (row["event"], row["seq"], json.loads(row["frames"])[0]["id"]) == ("command", "0", "100")
 
 
+def test_following_waits_for_a_journal_that_is_not_there_yet(tmp_path: Path) -> None:
+    follower = subprocess.Popen([sys.executable, "-m", "ucs", "journal", str(tmp_path / "journal.db"), "--follow"], cwd=ROOT,
+                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert follower.stdout and follower.stderr
+    assert "waiting for `ucs run`" in follower.stderr.readline()
+    follower.send_signal(signal.SIGINT)
+    assert follower.wait(timeout=20) == 0
+    follower.stdout.close()
+    follower.stderr.close()
+
+
 def test_following_shows_events_as_they_come(tmp_path: Path) -> None:
     with Journal(tmp_path / "journal.db", "tractor-7") as journal:
         journal.append(EVENTS[:1], b"")
