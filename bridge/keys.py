@@ -75,7 +75,10 @@ def load_keys(path: Path) -> dict[str, Key]:
     keys: dict[str, Key] = {}
     for name, entry in table.items():
         found = _key(name, entry)
-        if isinstance(found, Key):
+        twin = next((key.name for key in keys.values() if isinstance(found, Key) and key.public == found.public), None)
+        if twin is not None:
+            problems.append(f"keys {path}: [{name}]: the same key as [{twin}], so its role is not clear; give each their own")
+        elif isinstance(found, Key):
             keys[name] = found
         else:
             problems.append(f"keys {path}: [{name}]: {found}")

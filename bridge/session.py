@@ -47,7 +47,8 @@ STRANGERS_NS = 200_000_000
 """Pause between answers to senders without a key."""
 UNKNOWN = "whether it was obeyed is not known"
 REFUSAL_NS = 500_000_000
-"""Pause between tellings of refusals to supervision."""
+"""Pause between tellings of refusals to supervision, doubled while they go on up to `REFUSAL_LONGEST_NS`."""
+REFUSAL_LONGEST_NS = 60_000_000_000
 REFUSALS = 20
 """Kinds of refusals told at a time."""
 SAID = 1000
@@ -112,6 +113,7 @@ class Bridge:
                           self._clock.now_ns())
         self._commands: dict[str, tuple[Passed, int]] = {}
         self._answer_strangers_ns = self._refusal_ns = 0
+        self._refusal_pause_ns = REFUSAL_NS
         self._refusals: Counter[tuple[str, str]] = Counter()
         self._link = BridgeLink(settings.journal)
         self._waker = Waker()
@@ -376,8 +378,10 @@ class Bridge:
         self.counters["command refused"] += 1
         self._say_once(f"command {refused.reason[:20]}",
                        f"command from level 2 refused: {refused.reason} (told once, then counted)")
-        if len(self._refusals) < REFUSALS:
-            self._refusals[refused.reason, refused.key] += 1
+        kind = (refused.reason if refused.known else refused.reason.partition(":")[0],
+                refused.key if refused.key in self._gate.keys else "")  # what a stranger writes makes no kind of its own
+        if kind in self._refusals or len(self._refusals) < REFUSALS:
+            self._refusals[kind] += 1
         if refused.known or now_ns >= self._answer_strangers_ns:
             self._answer_strangers_ns = max(self._answer_strangers_ns, now_ns if refused.known else now_ns + STRANGERS_NS)
             self._publish_result(refused.id, refused.seq, "refused", refused.reason, "" if refused.id else wire.digest(payload))
@@ -389,9 +393,11 @@ class Bridge:
                                             digest=digest), qos=1)
 
     def _tell_refusals(self, now_ns: int) -> None:
-        """Supervision makes alarms of refusals; it hears of them a few times a second at most."""
+        """Supervision makes events of refusals: ever less often while they go on, or a stranger would fill journal and radio."""
         if self._refusals and now_ns >= self._refusal_ns:
-            self._refusal_ns = now_ns + REFUSAL_NS
+            quiet = now_ns - self._refusal_ns > REFUSAL_LONGEST_NS
+            self._refusal_pause_ns = REFUSAL_NS if quiet else min(2 * self._refusal_pause_ns, REFUSAL_LONGEST_NS)
+            self._refusal_ns = now_ns + self._refusal_pause_ns
             for (reason, key), count in self._refusals.items():
                 self._link.refuse(reason, key, count)
             self._refusals.clear()

@@ -120,7 +120,14 @@ def test_a_flood_of_strangers_is_counted_but_hardly_answered(site: Site) -> None
 
     site.peer.until(obeyed)
     assert len(site.peer.messages(wire.Result)) - 1 <= allowed
-    eventually(lambda: site.link.receive() or sum(refusal.count for refusal in site.link.refusals) == 300)
+    for number in range(200):  # names and rubbish of every kind
+        site.peer.send("command", wire.encode(wire.Command(key=f"stranger-{number}", body="", signature="")))
+        site.peer.send("command", b"{" + b" " * number)
+    site.peer.until(lambda: site.thread.bridge.counters["command refused"] == 700)
+    eventually(lambda: site.link.receive() or sum(refusal.count for refusal in site.link.refusals) == 700)
+    assert {(refusal.reason, refusal.key) for refusal in site.link.refusals} == {
+        ("wrong signature", "chief"), ("unknown key", ""), ("malformed", "")}
+    assert len(site.link.refusals) < 20
 
 
 @pytest.mark.fault("a retained command", "refused")

@@ -54,6 +54,18 @@ def test_every_mistake_in_a_key_file_is_told(tmp_path: Path) -> None:
         'c]: expected role = "…" and public = "…"']
 
 
+def test_a_name_twice_or_a_key_twice_is_no_key_file(tmp_path: Path) -> None:
+    path = tmp_path / "keys.toml"
+    add_key(path, Key("guest", "view", public_bytes(make_private(tmp_path / "guest.key"))))
+    entry = path.read_text()
+    path.write_text(entry + entry.replace('"view"', '"reset"'))
+    with pytest.raises(KeyFileError, match="can't be read"):
+        load_keys(path)
+    path.write_text(entry + entry.replace("guest", "chief").replace('"view"', '"reset"'))
+    with pytest.raises(KeyFileError, match=r"\[chief\]: the same key as \[guest\], so its role is not clear"):
+        load_keys(path)
+
+
 @pytest.mark.parametrize("content", [None, b"\xff", b"no = = toml"])
 def test_a_key_file_that_cannot_be_read_is_told(tmp_path: Path, content: bytes | None) -> None:
     if content is not None:
