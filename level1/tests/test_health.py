@@ -337,13 +337,34 @@ class TestHousekeeping:
         assert first.values["TrafficLog"] is None and first.values["GnssQuality"] is None
         assert load_.values["TrafficLogDropped"] is None
 
+    @pytest.mark.fault("journal corrupt at the start")
+    @pytest.mark.parametrize(("incident", "word"), [
+        ("journal j.db was corrupt: kept as j.db.corrupt-2, 3 events saved from it", "JournalCorrupt"),
+        ("journal j.db is too big: 500 events dropped that level 2 never got", "JournalFull"),
+        ("journal j.db was taken away while in use: a new one is begun", "JournalFailed")])
+    def test_what_befell_a_journal_that_works_again_shows_long_enough_for_an_alarm(self, incident: str, word: str) -> None:
+        computer, journal = Computer(), Fixed()
+        house = housekeeping.Housekeeping(computer, [], journal)
+        journal.incidents = (incident,)
+        supervisor = Supervisor(CATALOG, unit="a", start_ns=0, readings=ALL)
+        told: list[Event] = []
+        for second in range(30):
+            computer.measured = [(second * S, WELL)]
+            reading = house.take(0, 0)[0]
+            assert reading.values["JournalState"] == (word if second < 10 else "JournalOk")
+            raws = health.raws(CATALOG.messages[HEALTH], reading.values)
+            told += [out for out in supervisor.publish(second * S, HEALTH, raws) if isinstance(out, Event)]
+        assert [event.event for event in told if event.alarm == "JournalFault"] == ["raised", "cleared"]
+        assert next(event for event in told if event.alarm == "JournalFault").values["UCS_HEALTH.JournalState"] == word
+
     @pytest.mark.parametrize(("fault", "word"), [
         (None, "JournalOk"), ("journal j.db: can't be written (database or disk is full); 3 events wait in memory", "JournalFull"),
         ("journal j.db: the disk is full but for the reserve for alarms, which is in use", "JournalFull"),
         ("journal j.db: can't be written (attempt to write a readonly database)", "JournalReadOnly"),
         ("journal j.db: can't be written (Read-only file system)", "JournalReadOnly"),
         ("journal j.db: can't be written (database disk image is malformed)", "JournalCorrupt"),
-        ("journal j.db: the disk is slow", "JournalFailed"), ("journal j.db: can't be written (disk I/O error)", "JournalFailed")])
+        ("journal full/j.db: the disk is slow", "JournalFailed"),
+        ("journal j.db: can't be written (disk I/O error)", "JournalFailed")])
     def test_the_journals_own_words_are_understood(self, fault: str | None, word: str) -> None:
         assert housekeeping.journal_word(fault) == word
 

@@ -213,7 +213,7 @@ def truncate(path: Path) -> None:
 
 
 @pytest.mark.fault("journal corrupt at the start",
-                   "kept aside; what stands on sound pages is saved into a new one; boot ids and lock-outs stay")
+                   "kept aside; what stands on sound pages is saved into a new one; boot ids and lock-outs stay; an alarm says so")
 @pytest.mark.parametrize("damage", [damage_header, damage_middle, truncate])
 def test_a_corrupt_journal_is_kept_aside_and_a_new_one_begun(path: Path, damage: Callable[[Path], None]) -> None:
     with Journal(path, "tractor-7") as journal:
@@ -452,7 +452,7 @@ def test_a_path_that_cannot_be_written_is_told_in_one_line(path: str) -> None:
 # Size, versions, other files
 
 
-@pytest.mark.fault("journal over its size bound", "delivered events go first; undelivered ones last, and that is told")
+@pytest.mark.fault("journal over its size bound", "delivered events go first; undelivered ones last, and an alarm says so")
 def test_delivered_events_are_dropped_before_undelivered_ones(path: Path) -> None:
     with Journal(path, "tractor-7", keep_bytes=1_000_000) as journal:
         for first in range(1, 6001, 1000):
