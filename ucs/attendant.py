@@ -2,7 +2,7 @@
 
 Theory of operation. The supervisor belongs to the loop's thread, so the answer is put together there, between two turns: the
 desk's thread leaves a wish, wakes the loop and waits. A loop that does not come by within `PATIENCE_S` hangs; then the last
-answer is given, with how old it is. An answer costs the loop about 0.1 ms, and is given at most fifty times a second.
+answer is given, with how old it is. An answer costs the loop less than 0.1 ms, and is given at most fifty times a second.
 """
 from __future__ import annotations
 
@@ -55,6 +55,7 @@ class Attendant:
         self._lateness: deque[int] = deque([0, 0], maxlen=2)
         self._lateness_ns = self._begun_ns
         self._begun = False
+        self._version = version()
         self._raised_ns: dict[int, int] = {}
         self._story: dict[int, str] = {}
         self._wanted, self._given = threading.Event(), threading.Event()
@@ -110,7 +111,7 @@ class Attendant:
         is_armed = {name: name in armed or name.partition("@")[0] in armed for name in repairable}
         gnss, recorder = sources.gnss, sources.recorder
         return RunStanding(
-            unit=supervisor.unit, fleet=fleet, version=version(), pid=os.getpid(), boot=supervisor.boot, seq=supervisor.seq,
+            unit=supervisor.unit, fleet=fleet, version=self._version, pid=os.getpid(), boot=supervisor.boot, seq=supervisor.seq,
             uptime_s=(now_ns - self._begun_ns) / 1e9, turn_age_s=0.0, lateness_s=max(self._lateness) / 1e9, mode=supervisor.mode,
             utc_trusted=supervisor.utc_trusted, buses=tuple(bus_standing(port, now_ns, port.state) for port in live.ports),
             alarms=tuple(self._alarm(machine, repair, now_ns, is_armed.get(machine.definition.name, True))

@@ -377,7 +377,9 @@ def _show(monitor: Monitor, page: str) -> None:
             if now_s >= due_s:
                 due_s = now_s + REFRESH_S
                 sight = sight if view.paused else monitor.sight()
-                terminal.draw(pages.screen(sight, view, *terminal.size))
+                lines, top = pages.screen(sight, view, *terminal.size)
+                view = view._replace(top=top)
+                terminal.draw(lines)
             for key in terminal.wait(DRAIN_S):
                 changed = pressed(view, key, terminal.size[1])
                 if changed is None:

@@ -50,8 +50,8 @@ class View(NamedTuple):
     top: int = 0
 
 
-def screen(sight: Sight, view: View, columns: int, rows: int) -> list[Line]:
-    """All lines of the screen, at most so many."""
+def screen(sight: Sight, view: View, columns: int, rows: int) -> tuple[list[Line], int]:
+    """All lines of the screen, at most so many; and the first line shown of the page, where it has no more."""
     head, foot = list(_head(sight, view, columns)), _foot(view, columns)
     room = max(0, rows - len(head) - 1)
     body = list(whole_page(sight, view, columns, room))
@@ -60,7 +60,7 @@ def screen(sight: Sight, view: View, columns: int, rows: int) -> list[Line]:
     if top + room < len(body) and shown:
         shown[-1] = [(f"↓ {len(body) - top - room + 1} lines more", DIM)]
     blank: list[Line] = [[]] * (room - len(shown))
-    return [*head, *shown, *blank, foot][:rows]
+    return [*head, *shown, *blank, foot][:rows], top
 
 
 def whole_page(sight: Sight, view: View, columns: int, rows: int = 10_000) -> Iterator[Line]:

@@ -143,7 +143,7 @@ def test_attached_it_shows_the_repair_of_the_run_beside_the_signals_and_sends_no
             while not any("wait 30 s" in line for line in shown) and time.monotonic() < stop:
                 time.sleep(0.02)
                 monitor.drain()
-                shown[:] = [plain(line) for line in screen(monitor.sight(), View(), 140, 45)]
+                shown[:] = [plain(line) for line in screen(monitor.sight(), View(), 140, 45)[0]]
             shown.extend(plain(line) for line in whole_page(monitor.sight(), View(page="alarms"), 140))
             task.stop()
             heard.extend([listening.buses()[0].received, listening.buses()[0].sent])
@@ -177,27 +177,27 @@ def sight(catalog: Catalog) -> Sight:
 @pytest.mark.parametrize("page", PAGES)
 def test_every_page_fits_every_terminal(catalog: Catalog, page: str, size: tuple[int, int]) -> None:
     for top in (0, 10, 10**9):
-        lines = screen(sight(catalog), View(page=page, top=top), *size)
-        assert len(lines) <= size[1]
+        lines, first = screen(sight(catalog), View(page=page, top=top), *size)
+        assert len(lines) <= size[1] and first <= top
         assert all(cell_len(painted(line, size[0], False)) <= size[0] for line in lines)
 
 
 def test_the_first_page_holds_alarm_repair_failed_bus_and_signals_at_80_by_24(catalog: Catalog) -> None:
-    text = "\n".join(plain(line) for line in screen(sight(catalog), View(), 80, 24))
+    text = "\n".join(plain(line) for line in screen(sight(catalog), View(), 80, 24)[0])
     for told in ("PilotFlameOut", "High", "Repairing", "4.0 s", "attempt 2 of 3, step 2 of 7, 12.4 s left: wait 30 s",
                  "! bus implement (can0) is off", "SEEDER_STATUS", "10.0 Hz", "cycle 100 ms", "HopperLevel", "4.5 %", "q quit"):
         assert told in text, told
 
 
 def test_the_filter_leaves_what_has_the_text_in_its_name(catalog: Catalog) -> None:
-    text = "\n".join(plain(line) for line in screen(sight(catalog), View(page="signals", sought="hopperl"), 80, 24))
+    text = "\n".join(plain(line) for line in screen(sight(catalog), View(page="signals", sought="hopperl"), 80, 24)[0])
     assert "HopperLevel" in text and "Sowing" not in text
-    text = "\n".join(plain(line) for line in screen(sight(catalog), View(page="alarms", sought="pilot"), 80, 24))
+    text = "\n".join(plain(line) for line in screen(sight(catalog), View(page="alarms", sought="pilot"), 80, 24)[0])
     assert "PilotFlameOut" in text and "Alarm1" not in text
 
 
 def test_texts_of_files_cannot_steer_the_terminal(catalog: Catalog) -> None:
-    drawn = [painted(line, 80, False) for line in screen(sight(catalog), View(), 80, 24)]
+    drawn = [painted(line, 80, False) for line in screen(sight(catalog), View(), 80, 24)[0]]
     assert not any("\x1b" in line or "\n" in line for line in drawn) and harmless("a\x1b[2Jb") == "a·[2Jb"
 
 
