@@ -46,6 +46,7 @@ path = "journal.db"
 BABBLER = 0x18FE_F1AA
 ROUNDS = 100
 SAMPLES = 150
+PAUSE_S = 0.015
 SEED = 20_261_122
 
 
@@ -244,11 +245,11 @@ def test_plugs_pulled_a_hundred_times_leave_a_supervisor_that_works_and_a_journa
 
 
 def test_the_time_from_a_frame_to_raised_on_the_wire_and_the_memory_of_level_1(run: Process, plug: Plug) -> None:
-    """Told, not judged: what else the machine does decides about the worst."""
+    """Told, hardly judged: what else the machine does decides about the worst."""
     catalog = load(["flaming_tool.dbc"])
     status, alarms = catalog.messages["FLAMER_STATUS"], catalog.messages["FLAMER_ALARMS"]
     word = {name: raw for raw, name in status.signal("Safeguard").choices.items()}["CommandsLost"]
-    delays_ms = []
+    delays_ms, late_ms = [], []
     with Wire() as wire:
         wire.sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", alarms.can_id, 0x7FF))
         wire.sock.settimeout(2)
@@ -259,9 +260,14 @@ def test_the_time_from_a_frame_to_raised_on_the_wire_and_the_memory_of_level_1(r
             while bool(raw_of(alarms.signal("FlamerCommandsLost"), wire.sock.recv(16)[8:])) is not lost:
                 pass
             delays_ms.append((time.monotonic_ns() - begin_ns) / 1e6)
-            time.sleep(0.03)
+            slept_ns = time.monotonic_ns()
+            time.sleep(PAUSE_S)
+            late_ms.append((time.monotonic_ns() - slept_ns) / 1e6 - PAUSE_S * 1e3)
     delays_ms.sort()
+    late_ms.sort()
     resident = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{run.pid}/status").read_text())
     assert resident is not None
     print(f"frame to alarm on the wire: p50 {delays_ms[SAMPLES]:.1f} ms, p99 {delays_ms[2 * SAMPLES * 99 // 100]:.1f} ms, "
-          f"worst {delays_ms[-1]:.1f} ms; `ucs run` takes {int(resident[1]) / 1000:.1f} MB")
+          f"worst {delays_ms[-1]:.1f} ms; this machine wakes a sleeper late by p50 {late_ms[SAMPLES]:.1f} ms, "
+          f"p99 {late_ms[2 * SAMPLES * 99 // 100]:.1f} ms; `ucs run` takes {int(resident[1]) / 1000:.1f} MB")
+    assert delays_ms[SAMPLES] < IN_TIME_S * 1e3

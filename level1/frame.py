@@ -12,6 +12,10 @@ ERROR = 0x2000_0000
 BUS_SHIFT = 32
 
 
+Row = tuple[int, int, bytes]
+"""A frame on the hot path, where making a `Frame` of each costs more than judging it: time, key, data."""
+
+
 class Frame(NamedTuple):
     """A received or sent CAN frame.
 

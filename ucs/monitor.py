@@ -164,9 +164,7 @@ class Listening:
         """See `Source`."""
         if self.problems and self.now_ns() >= self._retry_ns:
             self._open(list(self.problems))
-        frames = self._inbox.take().frames
-        for port in self._ports:
-            frames += port.fetch()
+        frames = [*self._inbox.take().frames, *(Frame(*row) for port in self._ports for row in port.fetch())]
         frames.sort(key=lambda frame: frame.t_ns)
         return frames
 

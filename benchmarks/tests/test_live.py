@@ -13,4 +13,6 @@ def test_the_command_prints_the_ratio_and_a_line_for_each_contender() -> None:
     assert done.returncode == 0, done.stderr
     ratio = re.search(r"^ratio: ([\d.]+)$", done.stdout, re.MULTILINE)
     assert ratio and float(ratio[1]) > 0
-    assert len(re.findall(r"% of a core .* lost", done.stdout)) == 3
+    rows = re.findall(r"^  (.{34})((?: +[\d.]+){8})$", done.stdout, re.MULTILINE)
+    assert [name.split()[0] for name, _ in rows] == ["the", "python-can", "the"]
+    assert all(figures.split()[5] == "0" for _, figures in rows), "frames lost"

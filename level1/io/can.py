@@ -22,7 +22,7 @@ from typing import Protocol
 
 from level1.bus_health import BITS_A_FRAME, WINDOW_NS, BusHealth, Report, Traffic
 from level1.event import Send
-from level1.frame import Frame
+from level1.frame import Frame, Row
 from level1.io.config import Bus
 from level1.io.inbox import Inbox
 from level1.io.listening import Listening
@@ -31,9 +31,7 @@ from level1.io.socketcan import BusError, Filter, SocketCan
 __all__ = ["BusError", "Interface", "Port", "open_bus"]
 
 TICK_S = 0.05
-"""So often a bus's thread looks after its interface."""
-LATE_NS = 40_000_000
-"""A loop that has not fetched for so long is late."""
+"""So often a bus's thread looks after its interface. A loop that has not fetched in between is late."""
 RETRY_S = 0.25
 RETRY_SEND_NS = 1_000_000
 WAITING_SENDS = 200
@@ -61,7 +59,7 @@ class Interface(Protocol):
     def fileno(self) -> int | None:
         """The descriptor that becomes readable; None: `receive` waits by itself."""
 
-    def receive(self, bus: int) -> list[Frame]:
+    def receive(self, bus: int) -> Sequence[Row]:
         """The frames that have come."""
 
     def errors(self, bus: int) -> list[Frame]:
@@ -99,13 +97,14 @@ class Port:
         self._inbox, self._clock, self._wall = inbox, clock, wall
         self._opener = opener or open_bus
         self._wire: Interface | None = None
+        self._receive: Callable[[int], Sequence[Row]] | None = None
         self._lock = threading.Lock()
         self._waiting: deque[Send] = deque()
         self._unsent: Counter[str] = Counter()
         self._stopping = threading.Event()
         self._suspect = ""
         self._lost_ns: int | None = None
-        self._fetched_ns = 0
+        self._fetches = 0
         self._listening: Listening | None = None
         self._window = _Window(clock())
         self._thread = threading.Thread(target=self._run, name=f"bus {settings.name}", daemon=True)
@@ -185,25 +184,23 @@ class Port:
         self.counters[word] += 1
         self._unsent[frame.message] += 1
 
-    # --- in: the loop's thread ----------------------------------------------------------------------------------------
+    # --- in: the loop's thread, or the bus's where the loop is late ------------------------------------------------------
 
-    def fetch(self) -> list[Frame]:
+    def fetch(self) -> Sequence[Row]:
         """The frames that have come, of an interface with a descriptor; those of others are in the inbox."""
-        self._fetched_ns = self._clock()
-        return self._read()
-
-    def _read(self) -> list[Frame]:
+        self._fetches += 1
         with self._lock:
-            wire = self._wire
-            if wire is None or wire.fileno() is None:
+            receive = self._receive
+            if receive is None:
                 return []
             try:
-                frames = wire.receive(self.index)
+                frames = receive(self.index)
             except OSError as error:
                 self._suspect = reason(error)
                 return []
-            self._window.count(frames)
-            self.received += len(frames)
+            if frames:
+                self._window.count(frames)
+                self.received += len(frames)
             return frames
 
     # --- the bus's thread ---------------------------------------------------------------------------------------------
@@ -224,16 +221,16 @@ class Port:
             self._open()
         wire = self._wire
         assert wire is not None
-        if wire.fileno() is None:
+        if self._receive is None:
             frames = wire.receive(self.index)
             self._window.count(frames)
             self.received += len(frames)
         else:
+            fetches = self._fetches
             self._stopping.wait(TICK_S)
-            late = self._clock() - self._fetched_ns > LATE_NS
-            frames = self._read() if late else []
+            frames = self.fetch() if self._fetches == fetches else ()
         if frames:
-            self._inbox.put(frames)
+            self._inbox.put(Frame(*row) for row in frames)
         if self._suspect:
             raise BusError(self._suspect)
         if self._lost_ns is not None:
@@ -293,11 +290,16 @@ class Port:
         if self._wire is not None and self._listening is not None:
             self._wire.listen(None if wide else self._listening.filters)
 
+    def _adopt(self, wire: Interface | None) -> None:
+        """Use an open interface from now on, None: there is none. To be called with the lock."""
+        self._wire = wire
+        self._receive = None if wire is None or wire.fileno() is None else wire.receive
+
     def _open(self) -> None:
         wire = self._opener(self.settings, self._clock, self._wall)
         with self._lock:
             self._suspect = ""
-            self._wire = wire
+            self._adopt(wire)
             self._window = _Window(self._clock())
             self._window.sent = self.counters["sent"]
             self._apply(False)
@@ -322,7 +324,8 @@ class Port:
 
     def _close(self) -> None:
         with self._lock:
-            wire, self._wire = self._wire, None
+            wire = self._wire
+            self._adopt(None)
             if wire is None:
                 return
             descriptor = wire.fileno()
@@ -341,14 +344,14 @@ class _Window:
 
     def __init__(self, now_ns: int, before: _Window | None = None):
         self.begin_ns = now_ns
-        self._batches: list[Sequence[Frame]] = []
+        self._batches: list[Sequence[Row]] = []
         self.seen = 0
         self.sent = 0
         self.traffic: tuple[int, int] | None = None
         self.wide: bool = before is not None and before.wide
         self._lost: int = before._lost if before is not None else 0
 
-    def count(self, frames: Sequence[Frame]) -> None:
+    def count(self, frames: Sequence[Row]) -> None:
         """Frames have come."""
         if not frames:
             return

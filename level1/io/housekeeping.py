@@ -84,7 +84,7 @@ class Housekeeping:
         self._incident_ns: int | None = None
 
     def take(self, lateness_ns: int, dropped: int) -> list[Reading]:
-        """The readings since the last call, none within a period. lateness_ns: of this turn of the loop; dropped: frames lost
+        """The readings since the last call, none within a period. lateness_ns: the loop's worst since then; dropped: frames lost
         so far."""
         self._lateness_ns = max(self._lateness_ns, lateness_ns)
         measured = self._watch.take()

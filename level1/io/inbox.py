@@ -6,7 +6,7 @@ import select
 import threading
 import weakref
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -21,17 +21,21 @@ FRAMES = 20_000
 class Load(NamedTuple):
     """What had come since the last `take`. dropped: frames lost because too many waited, the oldest first."""
 
-    frames: list[Frame]
-    orders: list[Order]
-    reports: list[Report]
-    notices: list[str]
+    frames: Sequence[Frame]
+    orders: Sequence[Order]
+    reports: Sequence[Report]
+    notices: Sequence[str]
     dropped: int
+
+
+NOTHING = Load((), (), (), (), 0)
 
 
 class Inbox:
     """Filled by any thread, emptied by one. Frames are bounded; orders, reports and notices, which are few, are never dropped.
 
     It wakes the one that waits, as do the descriptors it is told to `watch`: of sockets that the loop reads itself.
+    rung: whether something has come, or `wake` was called, since the last `take`.
     """
 
     def __init__(self, frames: int = FRAMES):
@@ -44,7 +48,7 @@ class Inbox:
         self._lock = threading.Lock()
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         weakref.finalize(self, os.close, self._bell)
-        self._rung = False
+        self.rung = False
         self._poll = select.epoll()
         self._poll.register(self._bell, select.EPOLLIN)
 
@@ -86,8 +90,8 @@ class Inbox:
 
     def wake(self) -> None:
         """End a `wait`, also from a signal handler."""
-        if not self._rung:
-            self._rung = True
+        if not self.rung:
+            self.rung = True
             os.eventfd_write(self._bell, 1)
 
     def wait(self, timeout_s: float) -> None:
@@ -96,9 +100,9 @@ class Inbox:
 
     def take(self) -> Load:
         """All that is there."""
-        if not self._rung:
-            return Load([], [], [], [], 0)
-        self._rung = False
+        if not self.rung:
+            return NOTHING
+        self.rung = False
         with suppress(BlockingIOError):
             os.eventfd_read(self._bell)
         with self._lock:

@@ -2,10 +2,12 @@
 
 It waits for frames, orders or the next deadline; hands frames over in batches, in the order of their stamps; and brings what
 comes out to where it belongs: **events into the journal first, on the disk**, then frames to the buses, then results and
-monitoring messages to the link upward. On a busy bus waking up costs more than all the rest: between two turns of the loop there
-is at least `NAP_NS`, in which frames gather; a frame on a quiet bus is looked at at once.
+monitoring messages to the link upward. On a busy bus waking up costs more than all the rest: while turns of the loop follow
+each other within `BUSY_NS` there is at least `NAP_NS` between two, in which frames gather; a frame on a quiet bus is looked at at
+once. What a turn does without a reason to is paid a thousand times a second: it looks at the inbox, and asks for readings, only
+when the bell has rung.
 
-Time is the monotonic clock; UTC is a label, measured anew at every turn, because the wall clock of a tractor jumps.
+Time is the monotonic clock; UTC is a label, measured anew all the time, because the wall clock of a tractor jumps.
 """
 from __future__ import annotations
 
@@ -22,11 +24,11 @@ from level1 import bus_health, health
 from level1.bus_health import Report
 from level1.command import Order
 from level1.event import Commanded, Event, Monitor, Output, Result, Send, SentFrame, seconds
-from level1.frame import BUS_SHIFT, EXTENDED, Frame
+from level1.frame import BUS_SHIFT, EXTENDED, Row
 from level1.health import Reading
 from level1.io.can import Port
 from level1.io.host import clock_is_synchronised
-from level1.io.inbox import Inbox
+from level1.io.inbox import NOTHING, Inbox, Load
 from level1.io.listening import listening
 from level1.j1939_node import ADDRESS_CLAIMED
 from level1.memory import State
@@ -35,7 +37,13 @@ from level1.supervisor import COMMAND, Supervisor
 LAG_NS = 2_000_000
 """Deadlines are served so late, that a frame stamped before one, which its reader hands over a moment later, still counts."""
 LONGEST_WAIT_S = 1.0
-NAP_NS = 900_000
+NAP_NS = 1_050_000
+"""From one turn to the next on a busy bus: what is left of it is slept, less than a millisecond."""
+NAP_S = NAP_NS / 1e9
+BUSY_NS = 2 * NAP_NS
+"""Turns that follow each other so fast, frames in all of them, make a bus a busy one."""
+LABEL_PERIOD_NS = 10_000_000
+"""So often UTC is measured."""
 QUIET_NS = 50_000_000
 """Where nothing comes out, journal and link are looked after so often."""
 LOSS_NS = 500_000_000
@@ -43,6 +51,8 @@ LOSS_NS = 500_000_000
 DROPPED = "UCS"
 """Key of the cause of `FramesLost` for frames of any bus that came faster than they were supervised."""
 TRUST_PERIOD_NS = 10_000_000_000
+YOUNG_OBJECTS = 20_000
+"""New objects that wait for the garbage collector: the frames of two windows of `bus_health` at the most, which need none."""
 _stamp = itemgetter(0)
 """Time of a frame or a reading."""
 
@@ -76,12 +86,12 @@ class Tap(Protocol):
     def reopen(self) -> None:
         """Begin a new file."""
 
-    def record(self, frames: Sequence[Frame] | Sequence[Send]) -> None:
+    def record(self, frames: Sequence[Row] | Sequence[Send]) -> None:
         """Record what was received or sent."""
 
 
 class Receiver(Protocol):
-    """What the loop needs of `level1.io.gnss.GnssReceiver`."""
+    """What the loop needs of `level1.io.gnss.GnssReceiver`, which wakes the inbox when it has readings."""
 
     def take(self) -> Sequence[Reading]:
         """The readings since the last call."""
@@ -94,10 +104,10 @@ class Receiver(Protocol):
 
 
 class House(Protocol):
-    """What the loop needs of `level1.io.housekeeping.Housekeeping`."""
+    """What the loop needs of `level1.io.housekeeping.Housekeeping`, whose watch wakes the inbox when it has measured."""
 
     def take(self, lateness_ns: int, dropped: int) -> Sequence[Reading]:
-        """The readings since the last call. lateness_ns: of this turn; dropped: frames lost so far."""
+        """The readings since the last call. lateness_ns: the worst since then; dropped: frames lost so far."""
 
 
 class Live:
@@ -123,7 +133,7 @@ class Live:
         self._stopping = False
         self._served_ns = clock()
         self._retry_ns: int | None = None
-        self._trust_due_ns = 0
+        self._trust_due_ns = self._label_due_ns = self._lateness_ns = 0
         self._fault: str | None = None
         self._incidents = 0
         self._nap = nap
@@ -144,37 +154,42 @@ class Live:
 
     def run(self) -> None:
         """Supervise until `stop`; then store the state."""
-        gc.collect()
-        gc.freeze()  # what is loaded stays: to look through all of it in the middle of the work takes 20 ms
+        settle_memory()
         try:
             while not self._stopping:
-                self.turn(self.patience_s())
+                self.turn(NAP_S if self._busy else self.patience_s())
         finally:
             self.journal.append((), encode_state(self.supervisor.state()))
 
     def turn(self, patience_s: float) -> None:
         """Wait at most so long for something to do, and do all there is."""
         self._wait(patience_s)
-        load = self.inbox.take()
-        frames = load.frames
-        for port in self.ports:
-            frames = frames + port.fetch() if frames else port.fetch()
-        now_ns = self._turned_ns = self._clock()
-        self._busy = bool(frames)
-        self._label(now_ns)
-        for text in load.notices:
-            self._notice(text)
-        if load.dropped:
-            self.dropped += load.dropped
-            self._notice(f"{load.dropped} frames dropped, the oldest first: supervision can't keep up")
-        frames.sort(key=_stamp)
-        outputs = self._feed(frames, self._readings(frames, now_ns))
-        self._served_ns = max(self._served_ns, now_ns - LAG_NS, self.supervisor.now_ns)
-        commands = [self._command(order, outputs) for order in load.orders]
-        deadline = self.supervisor.next_deadline()
+        load = self.inbox.take() if self.inbox.rung else NOTHING
+        frames = self._fetch(load.frames) if load.frames or len(self.ports) != 1 else self.ports[0].fetch()
+        now_ns = self._clock()
+        self._busy = bool(frames) and now_ns - self._turned_ns < BUSY_NS
+        self._turned_ns = now_ns
+        if now_ns >= self._label_due_ns:
+            self._label(now_ns)
+        supervisor = self.supervisor
+        deadline = supervisor.next_deadline()
+        oldest_ns = now_ns if deadline is None else deadline
+        if frames and frames[0][0] < oldest_ns:
+            oldest_ns = frames[0][0]
+        if now_ns - oldest_ns > self._lateness_ns:
+            self._lateness_ns = now_ns - oldest_ns
+        readings = self._hear(load) if load is not NOTHING else ()
+        outputs = self._feed(frames, readings) if frames or readings else []
+        served_ns = now_ns - LAG_NS
+        if served_ns < supervisor.now_ns:
+            served_ns = supervisor.now_ns
+        if served_ns > self._served_ns:
+            self._served_ns = served_ns
+        commands = [self._command(order, outputs) for order in load.orders] if load.orders else ()
+        deadline = supervisor.next_deadline()
         if deadline is not None and deadline <= self._served_ns:
-            outputs.extend(self.supervisor.tick(self._served_ns))
-        if load.reports or load.dropped or self._missing or not self._begun:
+            outputs.extend(supervisor.tick(self._served_ns))
+        if load is not NOTHING or self._missing or not self._begun:
             outputs.extend(self._tell(load.reports, load.dropped, now_ns))
         if outputs or self._retry_ns is not None or now_ns - self._delivered_ns >= QUIET_NS:
             self._delivered_ns = now_ns
@@ -195,11 +210,28 @@ class Live:
 
     def _wait(self, patience_s: float) -> None:
         """Until something comes; on a busy bus until enough has come."""
-        rest_ns = self._turned_ns + NAP_NS - self._clock()
-        if self._busy and 0 < rest_ns <= NAP_NS and patience_s > 0:
-            self._nap(min(rest_ns / 1e9, patience_s))
+        rest_ns = self._turned_ns + NAP_NS - self._clock() if self._busy else 0
+        if 0 < rest_ns <= NAP_NS and patience_s > 0:
+            self._nap(rest_ns / 1e9)
         else:
             self.inbox.wait(patience_s)
+
+    def _fetch(self, waiting: Sequence[Row]) -> list[Row]:
+        """The frames of all buses, in the order of their stamps. waiting: those that were in the inbox."""
+        frames = list(waiting)
+        for port in self.ports:
+            frames += port.fetch()
+        frames.sort(key=_stamp)
+        return frames
+
+    def _hear(self, load: Load) -> list[Reading]:
+        """The bell has rung: tell what is to be told at once, and take what the UCS says of itself."""
+        for text in load.notices:
+            self._notice(text)
+        if load.dropped:
+            self.dropped += load.dropped
+            self._notice(f"{load.dropped} frames dropped, the oldest first: supervision can't keep up")
+        return self._readings()
 
     # --- the health of the buses --------------------------------------------------------------------------------------
 
@@ -256,22 +288,21 @@ class Live:
                 self._addresses[bus] = source
                 self._listen(self.ports[bus])
 
-    def _readings(self, frames: Sequence[Frame], now_ns: int) -> list[Reading]:
-        """What the UCS says of itself since the last turn, in the order of the stamps."""
+    def _readings(self) -> list[Reading]:
+        """What the UCS says of itself since the last call, in the order of the stamps."""
         readings = list(self._gnss.take()) if self._gnss is not None else []
         if self._house is not None:
-            deadline = self.supervisor.next_deadline()
-            oldest_ns = min(frames[0].t_ns if frames else now_ns, now_ns if deadline is None else deadline)
-            readings += self._house.take(max(0, now_ns - oldest_ns), self.dropped)
+            readings += self._house.take(self._lateness_ns, self.dropped)
+            self._lateness_ns = 0
         readings.sort(key=_stamp)
         return readings
 
-    def _feed(self, frames: list[Frame], readings: Sequence[Reading]) -> list[Output]:
+    def _feed(self, frames: Sequence[Row], readings: Sequence[Reading]) -> list[Output]:
         """Frames of several buses and the readings among them, in the order of their stamps."""
-        if not frames and not readings:
-            return []
         if self._recorder is not None:
             self._recorder.record(frames)
+        if not readings:
+            return self.supervisor.receive_many(frames)
         outputs: list[Output] = []
         begin = 0
         for reading in readings:
@@ -337,12 +368,21 @@ class Live:
     def _label(self, now_ns: int) -> None:
         """UTC beside the time line, and whether it is to be trusted: the wall clock if something keeps it right, else the
         satellites, else the wall clock all the same."""
+        self._label_due_ns = now_ns + LABEL_PERIOD_NS
         if now_ns >= self._trust_due_ns:
             self._trust_due_ns = now_ns + TRUST_PERIOD_NS
             self._synchronised = clock_is_synchronised()
         offset_ns = None if self._synchronised or self._gnss is None else self._gnss.utc_offset_ns()
         self.supervisor.utc_offset_ns = self._wall() - now_ns if offset_ns is None else offset_ns
         self.supervisor.utc_trusted = self._synchronised or offset_ns is not None
+
+
+def settle_memory() -> None:
+    """What is loaded stays: to look through all of it in the middle of the work takes 20 ms. What comes later is let go without
+    the garbage collector, but for a few cycles; it need not look every hundred frames."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(YOUNG_OBJECTS)
 
 
 def sent_frame(send: Send) -> SentFrame:

@@ -24,7 +24,7 @@ from pathlib import Path
 import can
 
 from level1.event import Send
-from level1.frame import BUS_SHIFT, ERROR, EXTENDED, REMOTE, Frame
+from level1.frame import BUS_SHIFT, ERROR, EXTENDED, REMOTE, Row
 from level1.io.message import CLASSIC_BYTES
 
 QUEUE_FRAMES = 20_000
@@ -61,7 +61,7 @@ class Recorder:
         self._max_bytes, self._reserve_bytes, self._queue_frames = max_bytes, reserve_bytes, queue_frames
         self._file_bytes = min(max(max_bytes // FILES, SMALLEST_FILE), LARGEST_FILE)
         self._clock, self._wall, self._notice = clock, wall, notice
-        self._queue: deque[Frame | Send] = deque()
+        self._queue: deque[Row | Send] = deque()
         self._fault: str | None = None
         self._dropped_ns: int | None = None
         self._retry_ns = clock()
@@ -98,8 +98,8 @@ class Recorder:
         self._renewed.set()
         self._filled.set()
 
-    def record(self, frames: Sequence[Frame] | Sequence[Send]) -> None:
-        """Record frames received (`Frame`) or sent (`Send`). Never waits for the disk."""
+    def record(self, frames: Sequence[Row] | Sequence[Send]) -> None:
+        """Record frames received (rows) or sent (`Send`). Never waits for the disk."""
         with self._lock:
             room = self._queue_frames - len(self._queue)
             self._queue.extend(frames if len(frames) <= room else islice(frames, room))
@@ -129,7 +129,7 @@ class Recorder:
         if self._fault is not None and now_ns < self._retry_ns and not renewed:
             self._forget(self._waiting())
             return
-        portion: deque[Frame | Send] = deque()
+        portion: deque[Row | Send] = deque()
         self._busy = True
         try:
             if renewed:
@@ -161,7 +161,7 @@ class Recorder:
             self._file = None
         self._notice(f"traffic recorder {self.folder}: begins a new file")
 
-    def _portion(self) -> deque[Frame | Send]:
+    def _portion(self) -> deque[Row | Send]:
         with self._lock:
             return deque(self._queue.popleft() for _ in range(min(PORTION, len(self._queue))))
 
@@ -177,7 +177,7 @@ class Recorder:
                 self.dropped += count
             self._dropped_ns = self._clock()
 
-    def _write(self, portion: deque[Frame | Send]) -> None:
+    def _write(self, portion: deque[Row | Send]) -> None:
         """Write and take out one after the other: what is left then was not written."""
         while portion:
             item = portion[0]
@@ -251,7 +251,7 @@ class _File:
     The file is closed once after its first frame, so that its head tells the time even after a power cut.
     """
 
-    def __init__(self, path: Path, offset_ns: int, first: Frame | Send):
+    def __init__(self, path: Path, offset_ns: int, first: Row | Send):
         self.path = path
         self._offset_ns = offset_ns
         try:
@@ -279,7 +279,7 @@ class _File:
         except OSError:
             return False
 
-    def add(self, item: Frame | Send) -> None:
+    def add(self, item: Row | Send) -> None:
         """Write a frame."""
         self._writer.on_message_received(self._message(item))
         self._added += 1
@@ -315,12 +315,12 @@ class _File:
             os.truncate(self.path, self._good)
         return self._added - self._kept
 
-    def _message(self, item: Frame | Send) -> can.Message:
-        key = item.key
+    def _message(self, item: Row | Send) -> can.Message:
+        t_ns, key, data = (item.t_ns, item.key, item.data) if isinstance(item, Send) else item
         can_id = key & (0x1FFF_FFFF if key & EXTENDED else 0x1FFF_FFFF if key & ERROR else 0x7FF)
         is_remote = bool(key & REMOTE)
-        return can.Message(timestamp=(item.t_ns + self._offset_ns) / 1e9, arbitration_id=can_id,
+        return can.Message(timestamp=(t_ns + self._offset_ns) / 1e9, arbitration_id=can_id,
                            is_extended_id=bool(key & EXTENDED), is_remote_frame=is_remote,
-                           is_error_frame=bool(key & ERROR), channel=(key >> BUS_SHIFT) & 0xFF, dlc=len(item.data),
-                           data=None if is_remote else item.data,
-                           is_fd=len(item.data) > CLASSIC_BYTES, is_rx=isinstance(item, Frame))
+                           is_error_frame=bool(key & ERROR), channel=(key >> BUS_SHIFT) & 0xFF, dlc=len(data),
+                           data=None if is_remote else data,
+                           is_fd=len(data) > CLASSIC_BYTES, is_rx=not isinstance(item, Send))

@@ -18,7 +18,7 @@ import struct
 import sys
 from collections.abc import Callable, Iterable, Sequence
 
-from level1.frame import BUS_SHIFT, EXTENDED, REMOTE, Frame
+from level1.frame import BUS_SHIFT, EXTENDED, REMOTE, Frame, Row
 from level1.io.config import Bus
 from level1.io.error import OutsideError
 from level1.io.stamps import PLAUSIBLE_AGE_NS, Stamps
@@ -67,6 +67,10 @@ class _Header(ctypes.Structure):
     _fields_ = (("message", _Message), ("length", ctypes.c_uint32))
 
 
+_HEADER = ctypes.sizeof(_Header)
+_LENGTH, _LENGTH_AT = struct.Struct("N").unpack_from, _Message.control_length.offset
+
+
 class Batches:
     """Reads a datagram socket on which each datagram is a CAN frame as Linux lays it out.
 
@@ -81,61 +85,63 @@ class Batches:
         self._clock, self._wall, self._stamps = clock, wall, Stamps()
         for option in (_TIMESTAMPNS, _RXQ_OVFL):
             sock.setsockopt(socket.SOL_SOCKET, option, 1)
-        self._size = frame_bytes
-        self._frames = ctypes.create_string_buffer(BATCH * frame_bytes)
-        self._control = ctypes.create_string_buffer(BATCH * _CONTROL)
+        # Frame and control data of each message lie side by side: one cut gives all that belongs together.
+        self._stride, self._room = frame_bytes + _CONTROL, frame_bytes - 8
+        self._memory = ctypes.create_string_buffer(BATCH * self._stride)
         self._vectors = (_Vector * BATCH)()
         self._headers = (_Header * BATCH)()
         for i in range(BATCH):
-            self._vectors[i] = _Vector(ctypes.addressof(self._frames) + i * frame_bytes, frame_bytes)
-            self._headers[i].message = _Message(
-                None, 0, ctypes.addressof(self._vectors[i]), 1, ctypes.addressof(self._control) + i * _CONTROL, _CONTROL, 0)
-        self._fresh = bytes(self._headers)
-        self._frame_view, self._control_view = memoryview(self._frames).cast("B"), memoryview(self._control).cast("B")
-        self._cut_frames = struct.Struct(f"=IB3x{frame_bytes - 8}s").iter_unpack
-        self._cut_stamps = struct.Struct(f"={_STAMP_AT}xqq{_CONTROL - _STAMP_AT - 16}x").iter_unpack
+            place = ctypes.addressof(self._memory) + i * self._stride
+            self._vectors[i] = _Vector(place, frame_bytes)
+            self._headers[i].message = _Message(None, 0, ctypes.addressof(self._vectors[i]), 1, place + frame_bytes, _CONTROL, 0)
+        self._view, self._header_view = memoryview(self._memory).cast("B"), memoryview(self._headers).cast("B")
+        fresh, self._used = memoryview(bytes(self._headers)), 0
+        self._resets = [(self._header_view[:count * _HEADER], fresh[:count * _HEADER]) for count in range(BATCH + 1)]
+        self._parts = [self._view[:count * self._stride] for count in range(BATCH + 1)]
+        self._cut = struct.Struct(f"=IB3x{frame_bytes - 8}s{_STAMP_AT}xqq{_CONTROL - _STAMP_AT - 16}x").iter_unpack
+        self._drops_at = frame_bytes + _DROPS_AT
         self._recvmmsg = ctypes.CDLL(None, use_errno=True).recvmmsg
 
-    def receive(self, bus: int) -> list[Frame]:
+    def receive(self, bus: int) -> list[Row]:
         """All that is there, without waiting. Raises OSError."""
-        found: list[Frame] = []
+        found: list[Row] = []
+        shift = bus << BUS_SHIFT
         for _ in range(MOST_BATCHES):
-            count = self._fetch()
-            if count:
-                self._cut(count, bus << BUS_SHIFT, found)
+            kept, fresh = self._resets[self._used]
+            kept[:] = fresh  # the kernel overwrote the lengths
+            count = self._used = self._recvmmsg(self._sock.fileno(), self._headers, BATCH, socket.MSG_DONTWAIT, None)
+            if count <= 0:
+                self._used = 0
+                self._check(count)
+                break
+            self._append(count, shift, found)
             if count < BATCH:
                 break
         if found:
-            self.last_ns = found[-1].t_ns
+            self.last_ns = found[-1][0]
         return found
 
-    def _fetch(self) -> int:
-        """Fill the buffers; gives the number of frames."""
-        headers = self._headers
-        ctypes.memmove(headers, self._fresh, len(self._fresh))  # the kernel overwrites the lengths
-        count: int = self._recvmmsg(self._sock.fileno(), headers, BATCH, socket.MSG_DONTWAIT, None)
-        if count < 0:
-            number = ctypes.get_errno()
-            if number in (errno.EAGAIN, errno.EINTR):
-                return 0
+    def _check(self, count: int) -> None:
+        """Raises OSError where `recvmmsg` gave no frame for another reason than that there is none."""
+        number = ctypes.get_errno() if count < 0 else 0
+        if number not in (0, errno.EAGAIN, errno.EINTR):
             raise OSError(number, os.strerror(number))
-        return count
 
-    def _cut(self, count: int, shift: int, found: list[Frame]) -> None:
+    def _append(self, count: int, shift: int, found: list[Row]) -> None:
+        """Cut up what was fetched."""
         before_ns, wall_ns, now_ns = self._clock(), self._wall(), self._clock()
         offset = self._stamps.offset_ns(before_ns, wall_ns, now_ns)
-        last = self._headers[count - 1].message.control_length
+        last, = _LENGTH(self._header_view, (count - 1) * _HEADER + _LENGTH_AT)
         if last > _STAMP_SPACE:
-            self.lost = int.from_bytes(self._control_view[(count - 1) * _CONTROL + _DROPS_AT:][:4], sys.byteorder)
+            self.lost = int.from_bytes(self._view[(count - 1) * self._stride + self._drops_at:][:4], sys.byteorder)
         if offset is None or not last:
             offset, oldest_ns = 0, now_ns
         else:
             oldest_ns = now_ns - PLAUSIBLE_AGE_NS
-        append, make = found.append, tuple.__new__  # as Frame(…) does it, at half the cost
-        for (can_id, size, data), (s, ns) in zip(self._cut_frames(self._frame_view[:count * self._size]),
-                                                 self._cut_stamps(self._control_view[:count * _CONTROL]), strict=True):
+        append, room = found.append, self._room
+        for can_id, size, data, s, ns in self._cut(self._parts[count]):
             t_ns = s * 1_000_000_000 + ns - offset
-            append(make(Frame, (t_ns if oldest_ns < t_ns <= now_ns else now_ns, can_id | shift, data[:size])))
+            append((t_ns if oldest_ns < t_ns <= now_ns else now_ns, can_id | shift, data if size == room else data[:size]))
 
 
 class SocketCan:
@@ -178,13 +184,13 @@ class SocketCan:
         """When the last frame came."""
         return self._batches.last_ns
 
-    def receive(self, bus: int) -> list[Frame]:
+    def receive(self, bus: int) -> list[Row]:
         """All frames that are there, without waiting. bus: index for their keys. Raises OSError when the interface is lost."""
         return self._batches.receive(bus)
 
     def errors(self, bus: int) -> list[Frame]:
         """All error message frames that are there."""
-        return self._errors.receive(bus)
+        return [Frame(*row) for row in self._errors.receive(bus)]
 
     def listen(self, filters: Sequence[Filter] | None) -> None:
         """Receive only what passes one of the filters; None: everything. Raises OSError."""

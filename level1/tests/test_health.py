@@ -407,6 +407,7 @@ class Bench:
 
     def turn_at(self, ms: int) -> None:
         self.now_ns = ms * MS
+        self.inbox.wake()  # as those do that have readings
         self.live.turn(0)
 
 

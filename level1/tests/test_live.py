@@ -19,7 +19,7 @@ from level1.catalog import Catalog
 from level1.command import Order
 from level1.decode import encode
 from level1.event import Commanded, Event, Monitor, Result, Send, SentFrame
-from level1.frame import ERROR, EXTENDED, Frame, frame_key
+from level1.frame import ERROR, EXTENDED, Frame, Row, frame_key
 from level1.gate import Gate
 from level1.health import Reading
 from level1.io import live
@@ -27,7 +27,7 @@ from level1.io.can import WAITING_SENDS, BusError, Interface, Port, open_bus
 from level1.io.config import Bus
 from level1.io.definitions import load
 from level1.io.host import clock_is_synchronised
-from level1.io.inbox import Inbox
+from level1.io.inbox import NOTHING, Inbox
 from level1.io.listening import Listening
 from level1.io.python_can import PythonCan
 from level1.io.socketcan import Filter
@@ -218,7 +218,7 @@ class TestInbox:
             inbox.put([Frame(number, 1, b"")])
         load = inbox.take()
         assert [frame.t_ns for frame in load.frames] == [2, 3, 4] and load.dropped == 2
-        assert inbox.take() == ([], [], [], [], 0)
+        assert inbox.take() == NOTHING
 
     def test_orders_and_notices_are_never_dropped(self) -> None:
         inbox = Inbox(frames=1)
@@ -368,7 +368,7 @@ class TestSending:
     def port(self, wire: Any) -> Port:
         port = Port(0, BUS, Inbox(), Clock(), Clock(), Opener(wire))
         if wire is not None:
-            port._wire = adapted(wire)
+            port._adopt(adapted(wire))
         return port
 
     def test_frames_go_out_in_order(self) -> None:
@@ -402,7 +402,7 @@ class TestSending:
         port = self.port(None)
         port.send(send(0, 5 * MS, 1), 0)
         port.send(send(0, 50 * MS, 2), 0)
-        port._wire = adapted(wire)
+        port._adopt(adapted(wire))
         assert port.flush(5 * MS + 1) is None
         assert [bytes(sent.data)[0] for sent in wire.sent] == [2]
         assert port.counters == {"expired": 1, "sent": 1}
@@ -466,7 +466,7 @@ class Unit:
         self.wire = Wire(send=lambda sent: self.log.append(("bus", sent.arbitration_id, bytes(sent.data))))
         self.inbox = Inbox(frames=100)
         self.port = Port(0, BUS, self.inbox, self.clock, self.wall, Opener(self.wire))
-        self.port._wire = adapted(self.wire)
+        self.port._adopt(adapted(self.wire))
         self.journal = Journal(self.log)
         supervisor = Supervisor(catalog, unit="a", boot=1, start_ns=self.clock(), monitor_ns=monitor_ns, **more)
         self.live = live.Live(supervisor, self.journal, [self.port], self.inbox, clock=self.clock, wall=self.wall,
@@ -553,11 +553,11 @@ class TestLive:
 
     def test_a_frame_the_interface_can_not_take_now_is_tried_again_soon(self, catalog: Catalog) -> None:
         unit = Unit(catalog)
-        unit.port._wire = None
+        unit.port._adopt(None)
         unit.turn_at(1_003)
         assert not [entry for entry in unit.log if entry[0] == "bus"]
         assert unit.live.patience_s() <= 0.001
-        unit.port._wire = adapted(unit.wire)
+        unit.port._adopt(adapted(unit.wire))
         assert [entry[1] for entry in unit.turn_at(1_004)] == [0x650]
 
     def test_an_order_is_answered_upward_and_its_effect_stored(self, catalog: Catalog) -> None:
@@ -620,7 +620,7 @@ class TestLive:
         unit = Unit(catalog)
         unit.turn_at(1_000)
         wire = Direct()
-        unit.port._wire = wire
+        unit.port._adopt(wire)
         for ms in range(1_000, 1_400, 100):
             wire.frames.append(Frame(ms * MS, 0x210, encode(
                 catalog.messages["FLAMER_STATUS"], {"Flaming": 1, "PilotFlame": 0, "Safeguard": 4}, None)))
@@ -656,7 +656,8 @@ class TestLive:
 
     def test_it_follows_the_address_that_the_ucs_claims(self, catalog: Catalog) -> None:
         unit = Unit(catalog, j1939={0: 0x80})
-        unit.port._wire = wire = Direct()
+        wire = Direct()
+        unit.port._adopt(wire)
         unit.turn_at(1_002)
         assert wire.filters is not None and (EXTENDED | 0x80, 0xC000_00FF) in wire.filters
 
@@ -670,7 +671,7 @@ class TestLive:
             def reopen(self) -> None:
                 self.asked += 1
 
-            def record(self, frames: Sequence[Frame] | Sequence[Send]) -> None:
+            def record(self, frames: Sequence[Row] | Sequence[Send]) -> None:
                 pass
 
             def take(self) -> Sequence[Reading]:
@@ -693,11 +694,19 @@ class TestLive:
     def test_on_a_busy_bus_it_naps_and_on_a_quiet_one_it_does_not(self, catalog: Catalog) -> None:
         naps: list[float] = []
         unit = Unit(catalog, nap=naps.append)
-        unit.turn_at(1_000)
-        unit.status(1_001 * MS)
-        unit.turn_at(1_001)
+        for ms in (1_000, 1_001, 1_002):
+            unit.status(ms * MS)
+            unit.turn_at(ms)
+        unit.clock.now_ns += MS // 10
         unit.live.turn(1.0)
-        assert naps == [live.NAP_NS / 1e9] and live.NAP_NS <= MS
+        assert naps == [(live.NAP_NS - MS // 10) / 1e9] and naps[0] <= 0.001
+        naps.clear()
+        for ms in (1_100, 1_200, 1_300):
+            unit.status(ms * MS)
+            unit.turn_at(ms)
+        unit.inbox.wake()
+        unit.live.turn(1.0)
+        assert naps == []
 
     def test_it_stops_and_stores_the_state(self, catalog: Catalog) -> None:
         unit = Unit(catalog)

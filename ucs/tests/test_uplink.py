@@ -76,7 +76,7 @@ def test_an_order_comes_in(ends: Ends) -> None:
     orders: list[Order] = []
     while not orders and time.monotonic() < end:
         ends.inbox.wait(0.1)
-        orders = ends.inbox.take().orders
+        orders += ends.inbox.take().orders
     assert orders == [Order("c1", "pause")]
 
 
