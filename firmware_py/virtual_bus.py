@@ -8,7 +8,7 @@ the order in which they were added, then the next frame starts: the same partici
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 from firmware_py.participant import BusFrame, Happening, Meddler, Participant, Selective, Storyteller
 
@@ -48,6 +48,10 @@ class _Place:
         self.due = _NEVER if due is None else due
 
 
+_Audience = tuple[tuple[_Place, ...], tuple[_Place, ...]]
+"""Who hears a frame, and which of them may have a story to tell."""
+
+
 class Simulation:
     """The bus with its participants. now_ns: where it has come to. frames: carried so far.
 
@@ -63,7 +67,7 @@ class Simulation:
         self.on_happening = on_happening
         self._bit_ns = 1_000_000_000 // bitrate
         self._places: list[_Place] = []
-        self._audiences: dict[tuple[int, bool, int], tuple[tuple[_Place, ...], bool]] = {}
+        self._audiences: dict[tuple[int, bool, int], _Audience] = {}
         self._waiting: list[tuple[int, int, BusFrame, _Place]] = []
         self._carried: tuple[int, BusFrame, _Place] | None = None
         self._order = 0
@@ -115,29 +119,35 @@ class Simulation:
 
     def _moment(self, t_ns: int, stirred: bool) -> None:
         """stirred: something may have happened to anybody since the last moment."""
+        places = self._places
+        tellers: Sequence[_Place] = ()
         if self._carried is not None and self._carried[0] <= t_ns:
-            stirred |= self._deliver(t_ns)
-        for place in self._places:
+            tellers = self._deliver(t_ns)
+        for place in places:
             if place.due > t_ns:
                 continue
-            stirred = True
             for frame in place.step(t_ns):
                 self._order += 1
                 heapq.heappush(self._waiting, (_rank(frame), self._order, frame, place))
             if place.meddles:
-                for other in self._places:
+                stirred = True
+                for other in places:
                     other.ask()
             else:
-                place.ask()
+                due = place.next_deadline()
+                place.due = _NEVER if due is None else due
+            if place.stories is not None:
+                stirred |= bool(tellers)
+                tellers = (*tellers, place)
         if self._carried is None and self._waiting:
             _, _, frame, sender = heapq.heappop(self._waiting)
             bits = (EXTENDED_BITS if frame[1] else STANDARD_BITS) + 8 * len(frame[2])
             self._carried = (t_ns + bits * self._bit_ns, frame, sender)
-        if stirred:
-            self._tell()
+        if stirred or tellers:
+            self._tell(places if stirred else tellers)
 
-    def _deliver(self, t_ns: int) -> bool:
-        """The frame that ended is heard; True when somebody who may tell stories heard it."""
+    def _deliver(self, t_ns: int) -> Sequence[_Place]:
+        """The frame that ended is heard; gives those who may have a story to tell of it."""
         assert self._carried is not None
         _, frame, sender = self._carried
         self._carried = None
@@ -146,24 +156,25 @@ class Simulation:
             self.on_frame(t_ns, frame)
         can_id, extended, data = frame
         try:
-            audience, stories = self._audiences[can_id, extended, id(sender)]
+            audience, tellers = self._audiences[can_id, extended, id(sender)]
         except KeyError:
-            audience, stories = self._find_audience(can_id, extended, sender)
+            audience, tellers = self._find_audience(can_id, extended, sender)
         for place in audience:
             place.receive(t_ns, can_id, extended, data)
-            place.ask()
-        return stories
+            due = place.next_deadline()
+            place.due = _NEVER if due is None else due
+        return tellers
 
-    def _find_audience(self, can_id: int, extended: bool, sender: _Place) -> tuple[tuple[_Place, ...], bool]:
+    def _find_audience(self, can_id: int, extended: bool, sender: _Place) -> _Audience:
         audience = tuple(place for place in self._places
                          if place is not sender and (place.hears is None or place.hears(can_id, extended)))
         if len(self._audiences) >= AUDIENCES_KEPT:
             self._audiences.clear()
-        known = self._audiences[can_id, extended, id(sender)] = (audience, any(place.stories for place in audience))
+        known = self._audiences[can_id, extended, id(sender)] = (audience, tuple(place for place in audience if place.stories))
         return known
 
-    def _tell(self) -> None:
-        for place in self._places:
+    def _tell(self, tellers: Iterable[_Place]) -> None:
+        for place in tellers:
             if place.stories is not None:
                 for happening in place.stories():
                     if self.on_happening is not None:

@@ -14,7 +14,7 @@ from itertools import chain
 from typing import Any
 
 from level1.alarm import AlarmMachine
-from level1.board import ALWAYS, Board, Cell, Watch
+from level1.board import ALWAYS, Board, Cell, Page, Watch
 from level1.can_gnss import CanReceiver
 from level1.canopen import DEVICE_EMERGENCY, DEVICE_SILENT, NMT, Device, Devices
 from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Catalog, Command, Message, Repair
@@ -204,7 +204,8 @@ class Supervisor:
 
     def bus_state(self, name: str) -> int:
         """State of an alarm as the bus shows it: the worst of its reported causes."""
-        return max((machine.state for machine in self._reported[name].values()), default=self._alarms[name].state)
+        reported = self._reported[name]
+        return max(machine.state for machine in reported.values()) if reported else self._alarms[name].state
 
     def report(self, t_ns: int, alarm: str, key: str, present: bool, detail: dict[str, Any], text: str) -> None:
         """A subsystem reports that one cause of an alarm is there, or no more (trouble codes, emergencies, lost heartbeats).
@@ -669,13 +670,18 @@ class _Broadcast:
         self.order = supervisor.timers.order()
         self.due = FAR
         self.alarms = [(alarm.name, alarm.signal) for alarm in supervisor.catalog.alarms.values() if alarm.message == message.name]
+        self.states: list[int] = []
+        self.payload = b""
 
     def expire(self, now_ns: int) -> None:
         """Send it as it is now."""
         supervisor = self.supervisor
-        payload = encode(self.message, {signal: supervisor.bus_state(name) for name, signal in self.alarms})
+        states = [supervisor.bus_state(name) for name, _ in self.alarms]
+        if states != self.states:
+            self.states = states
+            self.payload = encode(self.message, {signal: state for (_, signal), state in zip(self.alarms, states, strict=True)})
         try:
-            supervisor.send(now_ns, self.message.name, payload, "alarm states")
+            supervisor.send(now_ns, self.message.name, self.payload, "alarm states")
         except Refused:
             supervisor.counters["frames refused by the gate"] += 1
         if self.message.cycle_ns:
@@ -722,15 +728,20 @@ class _Sampler:
         """Take a sample of all values, each with its age and quality."""
         supervisor = self.supervisor
         refresh = supervisor.board.refresh
+        page: Page | None = None
+        age_s: float | None = None
         values: dict[str, Any] = {}
         ages: dict[str, float | None] = {}
         quality: dict[str, str] = {}
         for part in self.parts:
-            name, page = part.name, part.page
-            refresh(page)
-            grade = part.cell.quality if page.level >= 0 else NEVER
+            name, cell = part.name, part.cell
+            if page is not part.page:
+                page = part.page
+                refresh(page)
+                age_s = None if page.level < 0 else (now_ns - page.t_ns) / 1e9
+            grade = NEVER if page.level < 0 else cell.k - cell.base if cell.k >= cell.base else cell.classes.quality[cell.k]
             values[name] = None if grade != GOOD else part.value if page.data is part.data else part.look(page.data)
-            ages[name] = None if page.level < 0 else (now_ns - page.t_ns) / 1e9
+            ages[name] = age_s
             quality[name] = QUALITY_WORDS[grade]
         supervisor._out.append(Monitor(supervisor.unit, supervisor.boot, seconds(now_ns), supervisor.utc(now_ns),
                                        supervisor.utc_trusted, self.name, values, ages, quality))

@@ -166,6 +166,31 @@ def test_the_budget_refills_when_the_window_has_passed() -> None:
         assert words(tool.run(301)) == ["raised", "repair_started", "repaired", "cleared"]
 
 
+def test_where_only_failed_attempts_count_good_ones_are_given_back() -> None:
+    """Wind blows a flame out many times a day; three trials in vain are still the end."""
+    definition = msgspec.structs.replace(pilot_flame_out(), repair=msgspec.structs.replace(RELIGHT, counts_good=False))
+    tool = Flamer(supervisor([STATUS, COMMAND], [definition]))
+    tool.run(1)
+    for _ in range(8):
+        tool.flame = 0
+        assert words(tool.run(60)) == ["raised", "repair_started", "repaired", "cleared"]
+    tool.flame, tool.dead = 0, True
+    assert words(tool.run(110)) == ["raised", *["repair_started", "repair_failed"] * 3, "locked_out"]
+
+
+def test_failed_attempts_count_on_although_a_later_one_was_good() -> None:
+    definition = msgspec.structs.replace(pilot_flame_out(), repair=msgspec.structs.replace(RELIGHT, counts_good=False))
+    tool = Flamer(supervisor([STATUS, COMMAND], [definition]))
+    tool.run(1)
+    for _ in range(2):
+        tool.flame, tool.dead = 0, True
+        assert words(tool.run(36)) == ["raised", "repair_started", "repair_failed", "repair_started"]
+        tool.dead = False
+        assert words(tool.run(60)) == ["repaired", "cleared"]
+    tool.flame, tool.dead = 0, True
+    assert words(tool.run(36)) == ["raised", "repair_started", "repair_failed", "locked_out"]
+
+
 def test_lost_feedback_fails_the_attempt_and_closes_the_valve() -> None:
     tool = flamer()
     tool.flame = 0

@@ -523,3 +523,12 @@ def test_two_runs_report_the_same(catalog: Catalog) -> None:
     text = (SHIPPED / "sprayer_faults.toml").read_text("utf-8")
     assert Work(catalog, text).run(60).outputs == Work(catalog, text).run(60).outputs
     assert Work(catalog, text, seed=2).run(60).outputs != Work(catalog, text).run(60).outputs
+
+
+def test_sections_that_close_while_the_pumps_do_not_stop_are_no_alarm(catalog: Catalog) -> None:
+    """Level 1 holds spraying off; somebody orders it anew, and the mission controller its pattern."""
+    orders = (*WORK, "at 12 s: spraying off", "at 35 s: spraying on")
+    done = work(catalog, "at 10 s: sprayer refuses stop", orders=orders, duration="45 s").run()
+    assert done.life("SprayingStartStopFailure")[-1] == "locked_out"
+    assert done.sprayer.spraying
+    assert done.raised == {"SprayingStartStopFailure"}

@@ -268,6 +268,11 @@ def test_what_is_within_the_allowances_raises_nothing(catalog: Catalog, fault: s
     assert farm(catalog, fault, duration="1 min").run().events == []
 
 
+def test_a_receiver_that_comes_back_last_is_not_silent(catalog: Catalog) -> None:
+    """The engine's speed is known again a moment before the position is."""
+    assert "PositionSilent" not in farm(catalog, "at 20 s: tractor silent for 20 s", duration="1 min").run().raised
+
+
 def test_a_reset_of_the_vehicles_computer_brakes_and_switches_off(catalog: Catalog) -> None:
     reset = farm(catalog, "at 20 s: tractor reset").run(26)
     assert reset.kmh == 0
