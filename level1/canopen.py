@@ -14,7 +14,8 @@ while the program runs. From then on its heartbeat must come:
   be coupled at any time. It is silent when no right answer has come for its life time, guard time × life time factor, and half a
   guard time in which the last answer may be late. In right answers the highest bit alternates (CiA 301 §7.2.8.3.2.2.1): one with
   the bit of the answer before is none, so that a device whose program is dead is silent though its controller answers. After a
-  question without an answer either bit is right: it may be the question that was lost, or the answer.
+  question without an answer either bit is right: it may be the question that was lost, or the answer. When the program was held
+  up, what it has missed to ask is asked once, and the answer is waited for before a device counts as silent.
 - After a command to reset, the device has `BOOT_NS` to come back. A device that sends no heartbeat is not missed.
 - An emergency stays until the device says that it is over (error code 0x00xx) or has booted: both forget all its errors. When the
   error register that comes with 0x00xx still has bits set, only the errors are over whose own bit is not among them.
@@ -50,6 +51,8 @@ LIFE_FACTOR = 3
 """Life time factor of a guarded device for which none is given."""
 TOGGLE = 0x80
 """The bit that alternates in the answers of a guarded device."""
+QUESTION_NS = 1_000_000_000
+"""A question is worth asking for so long at least; late it does no harm, as a command would."""
 STAGGER_NS = 1_000_000
 """The first questions come this far apart by node id, so that not all are asked at once."""
 LONGEST_LEARNED_NS = 65_535_000_000
@@ -232,6 +235,9 @@ class _Node:
         deadline = self.deadline_ns
         if deadline is None or self.silent:
             return
+        until_ns = self._devices.timers.until_ns
+        if self.guard_ns and self._devices.asks and until_ns - now_ns > self.guard_ns // 2:
+            deadline = until_ns + self.guard_ns + self.guard_ns // 2
         if deadline > now_ns:
             self._devices.timers.set(self, deadline)
         else:
@@ -251,9 +257,11 @@ class _Guard:
         self.due = FAR
 
     def expire(self, now_ns: int) -> None:
-        """Ask; the question is worth nothing any more when the next one is due."""
-        self._host.hand_out(Send(now_ns, self._key, b"\0", "node guarding", "CANopen", now_ns + self.guard_ns))
-        self._timers.set(self, now_ns + self.guard_ns)
+        """Ask, unless the next question is due as well."""
+        next_ns = now_ns + self.guard_ns
+        if next_ns > self._timers.until_ns:
+            self._host.hand_out(Send(now_ns, self._key, b"\0", "node guarding", "CANopen", max(next_ns, now_ns + QUESTION_NS)))
+        self._timers.set(self, next_ns)
 
 
 class Devices:
@@ -266,6 +274,7 @@ class Devices:
     def __init__(self, catalog: Catalog, devices: Iterable[Device], host: Host, timers: Timers, counters: Counter[str],
                  asks: bool = True):
         self.timers = timers
+        self.asks = asks
         self._host = host
         self._counters = counters
         self._known = {(device.bus, device.node): device for device in devices}

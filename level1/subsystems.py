@@ -28,6 +28,8 @@ SECOND_TALKER = "SecondTalker"
 """Alarm of `ucs.dbc`: someone else sends a message that is the UCS's own."""
 QUIET_NS = 5_000_000_000
 """A stranger who has not been heard for so long has stopped: what only the UCS sends comes once a second."""
+MOST_USED = 256
+"""Identifiers with the own address that are watched: enough to know that a stranger is there, and no more for a babbling one."""
 PROTOCOL_LIFE_NS = 1_000_000_000
 """A frame of a protocol is worthless after this: T3 of the transport protocol is 1.25 s, and the first claim of an address must
 outlive the start of the program."""
@@ -67,6 +69,7 @@ class Subsystems:
         self._timers = timers
         self._strangers: dict[tuple[str, str], _Stranger] = {}
         self._addresses: dict[int, int] = {}
+        self._used: Counter[int] = Counter()
         self._codes: dict[int, dict[str, TroubleCodeReport]] = {}
         self._nodes = {bus: self._node(bus, address, unit, timers) for bus, address in addresses.items()}
         if wanted or self._nodes:
@@ -118,6 +121,9 @@ class Subsystems:
         node = self._nodes.get(bus)
         uses_address = node is not None and bool(key & EXTENDED) and key & 0xFF == node.address and \
             key >> 8 & 0x3FF00 != ADDRESS_CLAIMED
+        if uses_address:
+            self._used[bus] += 1
+            uses_address = self._used[bus] <= MOST_USED
         if key not in self.own_keys and not uses_address:
             return None
 
@@ -166,6 +172,7 @@ class Subsystems:
                              f"another node claims source address {contested}")
             if name is None and self._addresses.get(bus) != contested:  # it is the own one from now on
                 self._addresses[bus] = contested
+                self._used[bus] = 0
                 self.board.unbind(bus, contested)
         return Node(bus, name_of(crc32(unit.encode())), address, timers, transmit, conflict)
 

@@ -19,15 +19,16 @@ class Timed(Protocol):
 
 
 class Timers:
-    """A heap of deadlines. An entry whose owner has moved on is dropped when it comes up."""
+    """A heap of deadlines. An entry whose owner has moved on is dropped when it comes up. until_ns: time up to which deadlines are
+    being served; one far before it is served late."""
 
-    __slots__ = ("heap", "next_ns", "orders", "popped_ns")
+    __slots__ = ("heap", "next_ns", "orders", "popped_ns", "until_ns")
 
     def __init__(self) -> None:
         self.heap: list[tuple[int, int, Timed]] = []
         self.next_ns = FAR
         self.orders = 0
-        self.popped_ns = 0
+        self.popped_ns = self.until_ns = 0
 
     def order(self) -> int:
         """A new place in the order of equal deadlines."""
@@ -46,6 +47,7 @@ class Timers:
     def pop(self, now_ns: int) -> Timed | None:
         """The next item whose deadline (then `popped_ns`) is not after `now_ns`, with its `due` reset; None when there is none."""
         heap = self.heap
+        self.until_ns = now_ns
         while self.next_ns <= now_ns:
             due, _, item = heapq.heappop(heap)
             self.next_ns = heap[0][0] if heap else FAR

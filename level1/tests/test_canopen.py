@@ -249,7 +249,7 @@ def test_a_guarded_device_is_asked_every_guard_time_and_silent_after_its_life_ti
     assert valve.run(10 * SECOND) == []
     assert [question.t_ns for question in valve.asked] == [(42 + 200 * n) * MS for n in range(50)]
     assert {(question.key, question.data, question.expires_ns - question.t_ns) for question in valve.asked} == {
-        (0x72A | REMOTE, b"\0", 200 * MS)}
+        (0x72A | REMOTE, b"\0", SECOND)}
     valve.there = False
     events = valve.run(20 * SECOND)
     assert told(events) == [(10.544, "DeviceSilent", "raised")]
@@ -297,6 +297,19 @@ def test_a_guarded_device_that_was_never_there_is_missed_only_where_it_is_requir
     required.there = False
     events = required.run(20 * SECOND)
     assert told(events) == [(BOOT_NS / SECOND, "DeviceSilent", "raised")]
+
+
+def test_a_program_that_was_held_up_asks_once_and_waits_for_the_answer() -> None:
+    valve = Valve(unit(GUARDED, start_ns=0, broadcast=True))
+    valve.run(10 * SECOND)
+    asked = len(valve.asked)
+    outputs = valve.target.tick(15 * SECOND + 50 * MS)
+    question, = (output for output in outputs if isinstance(output, Send) and output.key & REMOTE)
+    assert told([*outputs, *valve.answer(question)]) == [] and valve.run(20 * SECOND) == []
+    assert len(valve.asked) == asked + 1 + 24
+    valve.there = False
+    valve.target.tick(25 * SECOND)
+    assert told(valve.run(30 * SECOND)) == [(25.3, "DeviceSilent", "raised")]
 
 
 def test_only_configured_devices_are_asked_and_nobody_in_a_replay() -> None:
