@@ -284,8 +284,8 @@ def _misjudged(socket: Socket, pulls: list[Pull], told: list[Event]) -> Iterator
         if not 0 <= late_s <= socket.told_s + SOON_S or not 0 <= over_s <= socket.over_s + SOON_S:
             yield f"{socket.name}: told {late_s:.2f} s after it was pulled, over {over_s:.2f} s after it was put in again"
         away_s = cleared.values.get("AwaySeconds")
-        if away_s is not None and abs(away_s - float(cleared.t - raised.t)) > 0.01:
-            yield f"{socket.name}: away for {away_s} s of {cleared.t - raised.t} s"
+        if away_s is not None and abs(away_s - (done.in_s - done.out_s)) > SOON_S:
+            yield f"{socket.name}: out for {done.in_s - done.out_s:.2f} s, and away for {away_s} s by the journal"
 
 
 def _misjudged_on_a_bus(socket: Socket, pulls: list[Pull], told: list[Event]) -> Iterator[str]:
