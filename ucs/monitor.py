@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -58,6 +59,9 @@ class Source(Protocol):
 
     def now_ns(self) -> int:
         """Time on the line of the stamps."""
+
+    def utc_offset_ns(self) -> int | None:
+        """UTC minus that time; None: not known."""
 
     def take(self) -> list[Frame]:
         """The frames since the last call, in order."""
@@ -160,12 +164,16 @@ class Listening:
         """Of the monotonic clock."""
         return time.monotonic_ns()
 
+    def utc_offset_ns(self) -> int | None:
+        """By the wall clock."""
+        return time.time_ns() - time.monotonic_ns()
+
     def take(self) -> list[Frame]:
         """See `Source`."""
         if self.problems and self.now_ns() >= self._retry_ns:
             self._open(list(self.problems))
         frames = [*self._inbox.take().frames, *(Frame(*row) for port in self._ports for row in port.fetch())]
-        frames.sort(key=lambda frame: frame.t_ns)
+        frames.sort(key=itemgetter(0))
         return frames
 
     def buses(self) -> list[BusStanding]:
@@ -217,6 +225,10 @@ class Recording:
         real_ns = self._paused_ns if self._paused_ns is not None else time.monotonic_ns()
         now_ns = self._log.first_ns + round((real_ns - self._begun_ns) * self._speed)
         return now_ns if self._waiting else min(now_ns, self._log.last_ns)
+
+    def utc_offset_ns(self) -> int | None:
+        """The stamps of most recordings are UTC."""
+        return 0 if self._log.is_utc else None
 
     def take(self) -> list[Frame]:
         """See `Source`."""
@@ -307,8 +319,7 @@ class Monitor:
     def __init__(self, title: str, catalog: Catalog, source: Source, unit: Unit | None = None):
         self.source = source
         self._title, self._unit = title, unit
-        live = not isinstance(source, Recording)
-        self._watching = Watching(catalog, title, source.now_ns(), time.time_ns() - source.now_ns() if live else None)
+        self._watching = Watching(catalog, title, source.now_ns(), source.utc_offset_ns())
 
     def drain(self) -> None:
         """Take what has come."""

@@ -16,7 +16,7 @@ PAGES = ("all", "alarms", "signals", "buses")
 DIM, BOLD, RED, YELLOW, GREEN, CYAN, INVERSE = "2", "1", "31", "33", "32", "36", "7"
 PRIORITY_COLOURS = {"Event": CYAN, "Low": "", "Medium": YELLOW, "High": RED, "Critical": "1;37;41"}
 STATE_COLOURS = {"Active": YELLOW, "Repairing": CYAN, "LockedOut": "1;31"}
-MESSAGE_COLOURS = {"ok": GREEN, "never": DIM, "slow": YELLOW, "fast": YELLOW, "short": YELLOW, "error": YELLOW}
+MESSAGE_COLOURS = {"ok": GREEN, "never": DIM, "slow": YELLOW, "fast": DIM, "short": YELLOW, "error": YELLOW}
 BUS_WORDS = {"BusActive": ("up", GREEN), "BusWarning": ("errors", YELLOW), "BusPassive": ("passive", YELLOW),
              "BusOff": ("off", RED), "BusDown": ("gone", RED)}
 COLUMN = 40
