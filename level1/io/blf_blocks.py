@@ -25,7 +25,7 @@ from level1.io.rows import HEAD_MASKS, MOST_TALKERS, Numbers, Rows
 SIGNATURE = b"LOGG"
 MESSAGE, CONTAINER, ERROR_FRAME, MESSAGE_2, FD_MESSAGE, FD_MESSAGE_64 = 1, 10, 73, 86, 100, 101
 """Types of objects."""
-BATCH_BYTES = 1 << 19
+BATCH_BYTES = 1 << 20
 """Unpacked bytes that are taken apart at a time."""
 MOST_BYTES = 1 << 24
 """A container or object larger than this is damage: writers use containers of 128 KB."""

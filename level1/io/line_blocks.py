@@ -30,8 +30,8 @@ MAX_SHAPES = 24
 """Shapes remembered for each length of a line, and lines of a length that are tried to learn one from, in each chunk."""
 SHORT_LINE = 24
 """Characters of a short line; where lines are shorter still, a block gets more room when it needs it."""
-CHUNK_BYTES = 1 << 18
-"""Text taken apart at a time; small enough for the second-level cache of a processor."""
+CHUNK_BYTES = 1 << 20
+"""Text taken apart at a time: enough that what each piece costs does not matter, little enough for a processor's cache."""
 
 HEXADECIMAL = re.compile(rb"[0-9A-Fa-f]+")
 NEWLINE, MARK, SPACE = b"\n# "
