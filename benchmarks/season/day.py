@@ -110,7 +110,8 @@ class Day:
         scenario = Scenario("", 0, plan.length_ns, plan.nodes, ())
         self._nodes = build(scenario, seed=Random(plan.seed).getrandbits(48), codec=codec).nodes
         self._world = World(self._nodes, codec)
-        self._people = People(plan.machine, self._world, Random(f"{plan.seed}/people"), self._carry_out)
+        self._people = People(plan.machine, self._world, Random(f"{plan.seed}/people"), self._carry_out,
+                              lambda: self._episodes.locked)
         self._unit = SimulatedUnit(Supervisor(catalog, unit="season", start_ns=0), self._deliver)
         self._episodes = Episodes(catalog)
         self._catalog = catalog
@@ -274,13 +275,17 @@ class Day:
             if alarm in watched.explains:
                 explained = True
                 watched.reported |= any(alarm in names for names in watched.names)
-        explained |= any(alarm in names and symptom.truth(self._world, past.fault.statement.index or 0)
-                         for past in self._past for names, symptom in zip(past.names, past.row.symptoms, strict=True))
+        explained |= self._left_behind(alarm)
         if alarm == OF[0]:
             explained = len(self._outs_s) >= OFTEN and self._outs_s[-1] - self._outs_s[0] <= OFTEN_S
         if not explained and not (alarm in NATURAL and NATURAL[alarm](self._world)):
             broken = ", ".join(f"{one.fault.node}.{one.fault.statement}" for one in (*self._active, *self._recent))
             self._wrong.append(f"{event.t:.2f} s: FALSE {alarm} ({broken or 'nothing is broken'}): {event.values}")
+
+    def _left_behind(self, alarm: str) -> bool:
+        """Whether it is a symptom, to be seen now, of what was broken before."""
+        return any(alarm in names and symptom.truth(self._world, past.fault.statement.index or 0)
+                   for past in self._past for names, symptom in zip(past.names, past.row.symptoms, strict=True))
 
     def _end(self, now_ns: int) -> None:
         self._world.now_ns = now_ns
@@ -289,7 +294,8 @@ class Day:
         self._wrong += [f"EPISODE {line}" for line in self._episodes.wrong]
         lasting = {alarm for watched in (*self._active, *self._recent) for alarm in watched.explains}
         self._wrong += [f"STANDS {name} at the end of the day, without a reason" for name in self._episodes.standing
-                        if name not in lasting and not (name in NATURAL and NATURAL[name](self._world)) and name != OF[0]]
+                        if name not in lasting and not self._left_behind(name) and name != OF[0]
+                        and not (name in NATURAL and NATURAL[name](self._world))]
         for node, plant in ((name, one) for name, one in self._nodes.items() if hasattr(one, "hazards")):
             for hazard in plant.hazards:
                 dangers = [fault for fault in self._plan.faults if (fault.node, fault.name) in DANGEROUS

@@ -453,7 +453,7 @@ NATURAL: Mapping[str, Callable[[World], bool]] = {
     "MainTankMismatch": lambda w: tank_differs_l(w) > 8,
     "MissionFinished": lambda w: w.tractor.mission == "Finished",
     "UnitStopped": lambda w: w.tractor.controller == "Stopped",
-    "UnitNotMoving": lambda w: w.tractor.reason == "NotMoving",
+    "UnitNotMoving": lambda w: w.tractor.reason == "NotMoving" or not w.tractor.engine.running,
     "FuelLow": lambda w: w.tractor.engine.fuel_percent < 15,
     "AirblastTankLow": lambda w: w.airblast.plant.level_percent < 20,
     "AirblastTankCritical": lambda w: w.airblast.plant.level_percent < 10,
