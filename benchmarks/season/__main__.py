@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import signal
 import sys
 import time
 from argparse import ArgumentParser
@@ -233,4 +234,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    for ending in (signal.SIGINT, signal.SIGTERM):  # also where a shell has it started in the background, deaf to Ctrl-C
+        signal.signal(ending, signal.default_int_handler)
     sys.exit(main())
