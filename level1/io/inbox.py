@@ -102,9 +102,9 @@ class Inbox:
         """All that is there."""
         if not self.rung:
             return NOTHING
-        self.rung = False
         with suppress(BlockingIOError):
             os.eventfd_read(self._bell)
+        self.rung = False  # only now: a bell rung before would be silenced, and who comes later would not ring it
         with self._lock:
             load = Load(list(self._frames), self._orders, self._reports, self._notices, self._dropped)
             self._frames.clear()
