@@ -20,6 +20,8 @@ from level1.io.rows import HEAD_MASKS, block_of_words, on_buses
 
 SOCKETCAN = 227
 """Link type of CAN frames."""
+_COOKED = (113, 276)
+"""Link types of `tcpdump -i any`."""
 BATCH_BYTES = 1 << 21
 """Bytes taken apart at a time: some 60,000 frames, so that what a block costs does not matter."""
 MOST_BYTES = 1 << 20
@@ -79,6 +81,9 @@ class PcapBlocks:
             link = struct.unpack_from(self._order + "L", head, 16)[0] & 0x0FFF_FFFF if len(head) == 20 else -1
             walk = self._walk
             self._interfaces = [Interface(0 if link == SOCKETCAN else -1, 0)]
+            if link in _COOKED:
+                self._skip("captured from all interfaces at once; capture a CAN interface itself: tcpdump -i can0 -w FILE")
+                return
             tail = b""
         else:
             walk, tail = self._walk_blocks, magic

@@ -123,6 +123,13 @@ def test_packets_that_are_no_can_frames_are_told(tmp_path: Path) -> None:
     assert log.complaints == ["unreadable packet 1: 12 data bytes in a packet of 16"]
 
 
+def test_a_capture_of_all_interfaces_says_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "any.pcap"
+    path.write_bytes(pcap([Frame(START_NS, 0x123, b"")], link=113))
+    with pytest.raises(LogError, match="captured from all interfaces at once; capture a CAN interface itself"):
+        list(Log(path).blocks())
+
+
 def test_a_capture_of_something_else_holds_no_frame(tmp_path: Path) -> None:
     path = tmp_path / "a.pcap"
     path.write_bytes(pcap([Frame(START_NS, 0x123, b"")], link=1))
