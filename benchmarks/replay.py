@@ -88,9 +88,9 @@ def _arguments() -> Namespace:
                         help="parts to run (default all)")
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=FORMATS, metavar="FORMAT",
                         help=f"of {', '.join(FORMATS)} (default all)")
-    parser.add_argument("--compared", type=int, default=1_000_000, metavar="N",
+    parser.add_argument("--compared", type=int, default=2_000_000, metavar="N",
                         help="frames of the recording that both read (default %(default)s)")
-    parser.add_argument("--rounds", type=int, default=3, help="how often each is timed (default %(default)s)")
+    parser.add_argument("--rounds", type=int, default=2, help="how often each is timed (default %(default)s)")
     parser.add_argument("--frames", type=int, default=10_000_000, metavar="N",
                         help="of the long recording; 100000000 takes 5 GB of disk (default %(default)s)")
     parser.add_argument("--shared", type=int, default=16_000_000, metavar="N",
