@@ -119,7 +119,7 @@ def _supervisor(settings: Config, catalog: Catalog, journal: Journal, own: froze
                 known: Sequence[Device]) -> Supervisor:
     """The supervisor of this boot, with the latches and budgets of the last one."""
     return Supervisor(catalog, unit=settings.unit.name, boot=journal.boot, armed=settings.repairs.armed,
-                      start_ns=time.monotonic_ns(), j1939=settings.j1939, restored=_restored(journal),
+                      j1939=settings.j1939, restored=_restored(journal),
                       monitor_ns=settings.bridge.period_ns if settings.bridge else None, readings=own, devices=known,
                       gnss_bus=settings.gnss_bus)
 

@@ -155,6 +155,9 @@ class Live:
     def run(self) -> None:
         """Supervise until `stop`; then store the state."""
         settle_memory()
+        now_ns = self._clock()
+        self._label(now_ns)
+        self.supervisor.begin(now_ns)  # not while things were made ready: what it then sends would be late at once
         try:
             while not self._stopping:
                 self.turn(NAP_S if self._busy else self.patience_s())

@@ -9,7 +9,7 @@ import pytest
 from bridge.link import BridgeLink
 from level1.command import Order
 from level1.event import Event, Result
-from level1.io.journal import Journal
+from level1.io.journal import Journal, read_events
 from level1.io.live import encode_state
 from level1.memory import AlarmMemory, State
 from ucs.main import main
@@ -27,6 +27,17 @@ def unit(tmp_path: Path) -> Path:
     with Journal(tmp_path / "journal.db", "tractor-7") as writing:
         assert writing.append([raised], encode_state(State("stopped", (memory,))))
     return file
+
+
+def test_what_a_restart_left_unfinished_is_told_with_the_time_of_day_and_sent_in_time(unit: Path) -> None:
+    journal = unit.parent / "journal.db"
+    memory = AlarmMemory("PilotFlameOut", 2, 1, False, 1, (0,), ())
+    with Journal(journal, "tractor-7") as writing:
+        writing.append((), encode_state(State("running", (memory,))))
+    beside_run(unit, lambda path: [awaited(path, lambda run: run.buses[0].sent > 0)].clear())
+    failed = read_events(journal)[1]
+    assert (failed.event, failed.text) == ("repair_failed", "the supervisor was restarted during the attempt")
+    assert failed.utc is not None
 
 
 def test_only_someone_at_the_machine_lets_a_stopped_unit_work_again(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
