@@ -48,11 +48,16 @@ class Adapter:
             os.close(self._master)
             self._master = self._slave = -1
 
+    @property
+    def is_plugged(self) -> bool:
+        """Whether it is in."""
+        return self._master >= 0
+
     def stop(self) -> None:
         """End it."""
         self._ended.set()
         self._thread.join()
-        if self._master >= 0:
+        if self.is_plugged:
             self.unplug()
 
     def hear(self, can_id: int, data: bytes, extended: bool = False) -> None:
@@ -80,7 +85,7 @@ class Adapter:
                 os.write(self._master, line)
 
     def _run(self) -> None:
-        while not self._ended.wait(0.001):
+        while not self._ended.wait(0.002):
             with self._lock:
                 if self._master >= 0 and self.drains and select.select([self._master], [], [], 0)[0]:
                     with suppress(OSError):

@@ -1,0 +1,89 @@
+"""A CAN adapter on a serial line by the kernel's own slcan: `ucs run` on the interface it makes, its plug pulled and put in."""
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from hil_tests.conftest import Process
+from level1.decode import encode
+from level1.io.definitions import load
+from level1.tests.lawicel import Adapter
+
+pytestmark = pytest.mark.vcan
+
+START_S, IN_TIME_S, BACK_S = 30.0, 1.0, 10.0
+STATUS = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
+UNIT = """
+[unit]
+name = "tractor-7"
+[[bus]]
+name = "implement"
+channel = "slcan0"
+dbc = ["ucs.dbc", "flaming_tool.dbc"]
+[repairs]
+armed = ["PilotFlameOut"]
+[journal]
+path = "journal.db"
+"""
+
+
+class Line:
+    """The adapter, and `slcand`, which makes an interface of its serial line."""
+
+    def __init__(self, path: Path):
+        self.adapter = Adapter(path)
+        self._daemon: subprocess.Popen[bytes] | None = None
+        self.attach()
+
+    def attach(self) -> None:
+        self._daemon = subprocess.Popen(["slcand", "-F", "-o", "-s5", os.path.realpath(self.adapter.path), "slcan0"],
+                                        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        end = time.monotonic() + BACK_S
+        while not Path("/sys/class/net/slcan0").exists():
+            assert time.monotonic() < end, "the kernel makes no interface"
+            time.sleep(0.05)
+        subprocess.run(["ip", "link", "set", "slcan0", "up"], check=True)
+
+    def detach(self) -> None:
+        """The adapter is pulled out."""
+        if self.adapter.is_plugged:
+            self.adapter.unplug()
+        if self._daemon is not None:
+            self._daemon.kill()
+            self._daemon.wait()
+            self._daemon = None
+
+
+@pytest.fixture
+def line(tmp_path: Path) -> Iterator[Line]:
+    one = Line(tmp_path / "ttyCAN")
+    yield one
+    one.detach()
+    one.adapter.stop()
+
+
+def test_an_adapter_by_the_kernels_slcan_is_supervised_pulled_out_and_found_again(
+        process: Callable[..., Process], line: Line, tmp_path: Path) -> None:
+    (tmp_path / "unit.toml").write_text(UNIT)
+    run = process("run", "unit.toml")
+    run.expect("; supervising$", START_S)
+    line.detach()
+    run.expect("CanBusDown +raised", IN_TIME_S)
+    line.adapter.plug()
+    line.attach()
+    run.expect("CanBusDown +cleared", BACK_S)
+    for counter in range(10):
+        line.adapter.hear(STATUS.can_id, encode(STATUS, {"Flaming": 1, "PilotFlame": 0, "AliveCounter": counter % 4}, None))
+        time.sleep(0.1)
+    run.expect("PilotFlameOut +raised", BACK_S)
+    run.expect("PilotFlameOut +repair started", BACK_S)
+    end = time.monotonic() + BACK_S
+    while not any(sent.startswith("t110") for sent in line.adapter.sent):
+        assert time.monotonic() < end, "no command reaches the adapter"
+        time.sleep(0.05)
+    assert run.stop() == 0
