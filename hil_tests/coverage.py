@@ -271,7 +271,8 @@ def _repair(alarm: Alarm) -> str:
     repair = alarm.repair
     if repair is None:
         return f"none: {NOT_REPAIRED.get(alarm.name, '')}"
-    tries = f"{repair.attempts} attempt{'s' * (repair.attempts != 1)} in {abbreviated(repair.window_ns)}"
+    failed = "" if repair.counts_good else "failed "
+    tries = f"{repair.attempts} {failed}attempt{'s' * (repair.attempts != 1)} in {abbreviated(repair.window_ns)}"
     end = f"`{_cell(repair.give_up_text)}`" if repair.give_up_text else "locked out"
     return f"`{_cell(repair.text)}`; {tries}; then {end}"
 

@@ -81,9 +81,10 @@ def _repair(alarm: Alarm, words: Words) -> str:
     where = " at the machine" if repair.local_reset else ""
     end = f" Then: {escape(give_up)}, held until someone resets the alarm{where}." if give_up else ""
     stopped = "The repair does not start while the unit is stopped or paused from above." if repair.moves else ""
+    good = "" if repair.counts_good else ", not counting those that were good,"
     times = "once" if repair.attempts == 1 else f"{repair.attempts} times"
     return (f"<h3>What the tractor tries by itself</h3><ol>{steps}</ol>"
-            f"<p>At most {times} within {duration(repair.window_ns)}.{end} A failed attempt goes to the safe state at once. "
+            f"<p>At most {times}{good} within {duration(repair.window_ns)}.{end} A failed attempt goes to the safe state at once. "
             f"{stopped}</p>{repair_svg(alarm)}")
 
 
@@ -203,6 +204,7 @@ def _markdown_lines(catalog: Catalog, title: str) -> Iterator[str]:
         if alarm.repair is not None:
             yield "**What the tractor tries by itself.**\n"
             yield from (f"{number}. {words.step(step)}." for number, step in enumerate(alarm.repair.steps, 1))
-            yield f"\nAt most {alarm.repair.attempts} × within {duration(alarm.repair.window_ns)}; then the safe state.\n"
+            good = "" if alarm.repair.counts_good else ", not counting those that were good,"
+            yield f"\nAt most {alarm.repair.attempts} ×{good} within {duration(alarm.repair.window_ns)}; then the safe state.\n"
         if alarm.when != Boolean(False):
             yield f"`{alarm.when_text}`"
