@@ -92,17 +92,19 @@ def test_what_was_received_and_sent_on_all_buses_can_be_read_again(bench: Callab
         Frame(START_NS + 4 * MS, frame_key(0x7FF, False, 2), bytes(range(64))),
         Frame(START_NS + 5 * MS, frame_key(0x7FF, False), b"")]
     one.recorder.record(frames)
-    one.recorder.record([Send(START_NS + 6 * MS, frame_key(0x110, False), b"\5", "FLAMER_CMD", "repair", START_NS + S)])
+    one.recorder.record([Send(START_NS + 6 * MS, frame_key(0x110, False), b"\5", "FLAMER_CMD", "repair", START_NS + S),
+                         Send(START_NS + 7 * MS, frame_key(0x72A, False) | REMOTE, b"\0", "node guarding", "CANopen", START_NS + S)])
     one.until(one.drained)
     one.recorder.stop()
     log = Log(one.files()[0])
     read = list(log.frames())
     assert [(frame.key, frame.data) for frame in read if not frame.key & ERROR] == [
-        (frame.key, frame.data) for frame in frames if not frame.key & ERROR] + [(frame_key(0x110, False), b"\5")]
+        (frame.key, frame.data) for frame in frames if not frame.key & ERROR] + [
+            (frame_key(0x110, False), b"\5"), (frame_key(0x72A, False) | REMOTE, b"")]
     assert read[0].t_ns == UTC_NS and abs(read[1].t_ns - UTC_NS - 1_500_000) < 2000
-    assert log.error_frames == 1 and log.remote_frames == 1
+    assert log.error_frames == 1 and log.remote_frames == 2
     recorded = messages(one.files()[0])
-    assert [message.is_rx for message in recorded] == [True] * 6 + [False]
+    assert [message.is_rx for message in recorded] == [True] * 6 + [False] * 2
     assert one.recorder.fault is None and one.recorder.dropped == 0 and not one.notices
 
 
