@@ -22,6 +22,8 @@ from level1.io.journal import FIRST, Position, Reader
 
 WINDOW = 32
 """Events in flight at most."""
+RESERVED = 4
+"""One part in so many of the window is for fresh events alone: a backlog that a poor link doesn't take must not hold them up."""
 RETRY_NS = 2_000_000_000
 """Wait for the first acknowledgement; doubled each time, up to `RETRY_LONGEST_NS`, give or take `JITTER`."""
 RETRY_LONGEST_NS = 60_000_000_000
@@ -92,7 +94,7 @@ class Outbox:
         deliveries = list(self._again(now_ns))
         if len(self._flights) < self._window:
             deliveries += self._send(self._fresh(self._window - len(self._flights)), now_ns)
-        room = min(self._window - len(self._flights), self._backlog_allowed(now_ns))
+        room = min(self._backlog_room, self._backlog_allowed(now_ns))
         if room > 0:
             deliveries += self._send(self._backlog(room) if not self._backlog_ended else self._lacking(room), now_ns)
         return deliveries
@@ -100,7 +102,7 @@ class Outbox:
     def next_due_ns(self) -> int | None:
         """When `due` will have something again, as far as it is known now; new events come on their own."""
         times = [flight.due_ns for flight in self._flights.values()]
-        if self._backlog_waits and len(self._flights) < self._window:
+        if self._backlog_waits and self._backlog_room > 0:
             times.append(self._backlog_due_ns)
         return min(times, default=None)
 
@@ -220,6 +222,10 @@ class Outbox:
                         yield self._delivery(event, True)
                 return
             del self._asked[boot]
+
+    @property
+    def _backlog_room(self) -> int:
+        return self._window - self._window // RESERVED - len(self._flights)
 
     @property
     def _backlog_waits(self) -> bool:

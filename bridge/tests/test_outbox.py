@@ -152,6 +152,17 @@ def test_many_new_events_on_a_poor_link_become_backlog_and_the_newest_goes_first
     assert seqs(unit.outbox.due(0)) == [FRESH + 2 * WINDOW]
 
 
+@pytest.mark.fault("poor link")
+def test_a_backlog_that_the_link_does_not_take_holds_no_new_event_up(unit: Unit) -> None:
+    unit.write(*range(1, 101))
+    unit.outbox.connected(0)
+    for second in range(60):
+        unit.outbox.due(second * S)
+    assert (unit.outbox.next_due_ns() or 0) > 59 * S  # and nothing is asked for all the time
+    unit.write(101)
+    assert [delivery.event.seq for delivery in unit.outbox.due(61 * S) if not delivery.historical] == [101]
+
+
 def test_every_event_of_every_boot_is_sent(unit: Unit) -> None:
     unit.write(1, 2)
     unit.reboot()
