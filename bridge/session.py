@@ -435,7 +435,8 @@ class Bridge:
             sample = self._samples.pop(name)
             self._sample_seq[name] += 1
             try:
-                self._publish("monitor", wire.monitor_message(sample, self._sample_seq[name]), name=name)
+                self._publish("monitor", wire.monitor_message(sample, self._sample_seq[name], self._period_ns / 1e9),
+                              name=name)
             except wire.WireError as error:
                 self._say_once(f"monitor {name}", str(error))
 

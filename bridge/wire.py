@@ -32,6 +32,8 @@ PAYLOAD_BYTES = 65_536
 NAME_BYTES = 64
 EXPONENT = 30
 """Numbers beyond 10**30 or finer than 10**-30 are refused."""
+PERIOD_S = 0.25
+"""Of monitoring messages, unless level 2 has asked for another or the unit's configuration says so (SPEC §3)."""
 RANGES = 64
 """Ranges an acknowledgement names at most."""
 
@@ -86,12 +88,14 @@ class MonitorMessage(Header, frozen=True, kw_only=True):
     """A monitoring message: state, never an alarm. Only the latest is ever sent; seq counts those of this `message`.
 
     values: number, value-table name or null; age_s: seconds since each was received; quality: of each, "ok" or why not.
+    period_s: so often it is sent now; level 2 can have it sent less often.
     """
 
     message: Name
     values: dict[str, Any]
     age_s: dict[str, float | None] = {}
     quality: dict[str, str] = {}
+    period_s: Annotated[float, Meta(ge=0, le=86_400)] = PERIOD_S
 
 
 class Alarm(Header, frozen=True, kw_only=True):
@@ -260,9 +264,9 @@ def read_event_line(line: bytes) -> Event:
     return _decode_event(line)
 
 
-def monitor_message(sample: Monitor, seq: int) -> MonitorMessage:
+def monitor_message(sample: Monitor, seq: int, period_s: float = PERIOD_S) -> MonitorMessage:
     """The message that carries a monitoring sample."""
-    return MonitorMessage(seq=seq, **{name: getattr(sample, name) for name in Monitor.__struct_fields__})
+    return MonitorMessage(seq=seq, period_s=period_s, **{name: getattr(sample, name) for name in Monitor.__struct_fields__})
 
 
 def signed_bytes(fleet: str, unit: str, body: str) -> bytes:

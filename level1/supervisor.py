@@ -20,7 +20,7 @@ from level1.canopen import DEVICE_EMERGENCY, DEVICE_SILENT, NMT, Device, Devices
 from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Catalog, Command, Message, Repair
 from level1.command import Order
 from level1.condition import Compiler, Things, Thresholds, Verdict, Zone, walk
-from level1.decode import GOOD, NEVER, QUALITY_WORDS, encode, reader
+from level1.decode import GOOD, NEVER, QUALITY_WORDS, encode, raw_range, reader
 from level1.event import PRIORITIES, Event, Monitor, Output, Result, Send, SentFrame, seconds
 from level1.expression import (
     ExpectStep,
@@ -588,6 +588,10 @@ class Supervisor:
             signal = message.signal(name)
             exact = (Fraction(order.value) - Fraction(signal.offset)) / Fraction(signal.factor)
             raws[name] = round(exact)
+            low, high = raw_range(signal)
+            if not low <= raws[name] <= high:
+                least, most = sorted(float(Fraction(signal.factor) * raw + Fraction(signal.offset)) for raw in (low, high))
+                raise Refused(f"{order.value} is outside {least:g} … {most:g}, what {name} can say")
         return encode(message, raws, self.holds.last_command(command.message))
 
     def _circumstances_changed(self, t_ns: int) -> None:

@@ -23,6 +23,8 @@ from level2.store import Arrival, Outcome, Sender, Store, StoreError
 
 SILENT_NS = 1_500_000_000
 """A unit not heard from for so long is told silent: six monitoring messages at 4 Hz (SPEC §3), within 2 s with the check."""
+PERIODS = 2
+"""Periods more that a unit may take which was asked to send less often than at 4 Hz."""
 CHECK_NS = 250_000_000
 ASK_NS = 5_000_000_000
 """How long a gap may stay before it is asked for, and between askings."""
@@ -69,6 +71,7 @@ class Receiver:
         self._connection: MqttConnection | None = None
         self._said: set[str] = set()
         self._heard_ns: dict[tuple[str, str], int] = {}
+        self._patience_ns: dict[tuple[str, str], int] = {}
         self._silent: set[tuple[str, str]] = set()
         self._gaps = {sender: _Gap(self._clock.now_ns() + settings.ask_ns) for sender in store.gaps()}
         self._check_ns = 0
@@ -225,6 +228,8 @@ class Receiver:
         if sample.message in latest or len(latest) < MONITORS:
             latest[sample.message] = sample
         self._heard_ns[unit] = now_ns
+        self._patience_ns[unit] = self.settings.silent_ns + (int((sample.period_s - wire.PERIOD_S) * PERIODS * 1e9)
+                                                             if sample.period_s > wire.PERIOD_S else 0)
         if unit in self._silent:
             self._silent.discard(unit)
             self._say(f"{topic.unit} is heard again")
@@ -235,10 +240,10 @@ class Receiver:
             self._heard_ns = {unit: heard_ns + turn_ns for unit, heard_ns in self._heard_ns.items()}
 
     def _tell_silent(self, now_ns: int) -> None:
-        for unit in [unit for unit, heard_ns in self._heard_ns.items() if now_ns - heard_ns > self.settings.silent_ns]:
+        for unit in [unit for unit, heard_ns in self._heard_ns.items() if now_ns - heard_ns > self._patience_ns[unit]]:
             del self._heard_ns[unit]
             self._silent.add(unit)
-            self._say(f"{unit[1]} is silent: no monitoring message for {self.settings.silent_ns / 1e9:g} s")
+            self._say(f"{unit[1]} is silent: no monitoring message for {self._patience_ns[unit] / 1e9:g} s")
 
     def _tell_connection(self, connection: MqttConnection, topic: wire.Topic, state: wire.Connection, retained: bool) -> None:
         waiting = f", {state.waiting} events to come" if state.waiting else ""

@@ -26,12 +26,12 @@ def an_event(seq: int, boot: int = 1) -> Event:
 class Setup:
     """A broker, a receiver in a thread, and a unit that does only what it is told to."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, silent_ns: int = 300_000_000):
         self.broker = EmbeddedBroker()
         self.store = Store(folder / "level2.db")
         self.arrivals: list[Arrival] = []
         self.said: list[str] = []
-        settings = Settings(self.broker.address, silent_ns=300_000_000, ask_ns=300_000_000)
+        settings = Settings(self.broker.address, silent_ns=silent_ns, ask_ns=300_000_000)
         self.receiver = Receiver(settings, self.store, told=self.arrivals.append, say=self.said.append)
         self.thread = ReceiverThread(self.receiver)
         self.unit = MqttConnection(self.broker.address, "unit", subscribe=[(f"ucs/v1/{FLEET}/{UNIT}/ack", 1)])
@@ -133,26 +133,31 @@ def test_a_unit_whose_monitoring_stops_is_told_silent_and_heard_again(setup: Set
     assert setup.receiver.latest[FLEET, UNIT]["burners"].values == {"a": 1}
     setup.publish("monitor", sample, "burners")
     setup.until(lambda: "tractor-7 is heard again" in setup.said)
+    seldom = wire.encode(wire.monitor_message(Monitor(UNIT, 1, seconds(5), None, False, "burners", {"a": 1}, {}, {}), 2, 0.75))
+    setup.publish("monitor", seldom, "burners")
+    setup.until(lambda: "tractor-7 is silent: no monitoring message for 1.3 s" in setup.said)
 
 
 @pytest.mark.fault("level 2's own disk is slow", "acknowledged later; no unit is told silent for it")
-def test_no_unit_is_told_silent_because_our_own_disk_is_slow(setup: Setup) -> None:
+def test_no_unit_is_told_silent_because_our_own_disk_is_slow(tmp_path: Path) -> None:
+    setup = Setup(tmp_path, silent_ns=900_000_000)  # the disk takes a second, SQLite's patience
     sample = wire.encode(wire.monitor_message(Monitor(UNIT, 1, seconds(5), None, False, "burners", {"a": 1}, {}, {}), 1))
     other = sqlite3.connect(setup.store.path, isolation_level=None)
     setup.publish("monitor", sample, "burners")
     setup.until(lambda: setup.receiver.counters["monitor"])
     other.execute("BEGIN IMMEDIATE")
     setup.send(1)
-    while not any("nothing is acknowledged" in line for line in setup.said):  # for a second, SQLite's patience
+    while not any("nothing is acknowledged" in line for line in setup.said):
         setup.publish("monitor", sample, "burners")
         setup.unit.wait(0)
         time.sleep(0.05)
-    setup.publish("monitor", sample, "burners")
     before = setup.receiver.counters["monitor"]
+    setup.publish("monitor", sample, "burners")
     setup.until(lambda: setup.receiver.counters["monitor"] > before)
     other.execute("ROLLBACK")
     other.close()
     assert not any("is silent:" in line for line in setup.said), setup.said
+    setup.close()
 
 
 def test_connections_are_told_and_greeted(setup: Setup) -> None:
