@@ -13,7 +13,7 @@ import numpy as np
 from level1.frame import EXTENDED
 from level1.io.line_blocks import Digits, LineBlocks, Shape, Sheet
 from level1.io.message import flagged_id
-from level1.io.text_format import TextFormat
+from level1.io.text_format import LATEST_S, TextFormat
 
 _ASC = re.compile(rb"\s*(\d+)\.(\d{1,6})\s+\d+\s+([0-9A-Fa-f]{1,8})(x?)\s+[RT]x\s+d\s+([0-8])(?:\s|$)")
 """`stamp channel ID[x] Rx d length data`."""
@@ -120,6 +120,8 @@ class TextBlocks(LineBlocks):
         if places is None or len(reads) != 1:
             return None
         _, t_ns, channel, key, data = reads[0]
+        if t_ns > (LATEST_S - 100) * 10**9:  # two digits of the seconds are open
+            return None
         first, step, count = places.data
         digits = b"".join(line[first + step * place:first + step * place + 2] for place in range(count))
         name = line[places.name[0]:sum(places.name)]
@@ -135,24 +137,24 @@ class TextBlocks(LineBlocks):
 
     def _read_first(self, sheet: Sheet) -> None:
         if not self._has_begun:
-            self._read_by_python_can(sheet, range(len(sheet.starts)), 1)
+            self._read_by_python_can(sheet, range(len(sheet.starts)), only_first=True)
 
     def _read_singly(self, sheet: Sheet, rows: list[int]) -> None:
         if rows and self._has_begun:
             self._read_by_python_can(sheet, rows)
 
-    def _read_by_python_can(self, sheet: Sheet, rows: Sequence[int], most: int | None = None) -> None:
-        """Read some lines; no more when so many frames have come, and none is left for others then up to the last of them."""
+    def _read_by_python_can(self, sheet: Sheet, rows: Sequence[int], only_first: bool = False) -> None:
+        """Read some lines; or, of all lines, those up to the first frame: whether a file is given up is decided before it."""
         lines = ((row, sheet.line(row).decode("utf-8", "replace")) for row in rows)
         for row, t_ns, channel, key, data in self._text.frames((self._lines + row + 1, line) for row, line in lines):
             place = row - self._lines - 1
             sheet.put_payloads(np.array([place]), channel.encode(), np.array([t_ns]),
                                np.array([self._talker(channel.encode(), key)], np.int32), np.frombuffer(data, np.uint8)[None, :])
-            if most == 1:
+            if only_first:
                 self._has_begun = True
                 sheet.done = place + 1
                 return
-        if most == 1:
+        if only_first:
             sheet.done = len(sheet.starts)
 
     def _pass_over(self, begin: bytes) -> None:

@@ -19,6 +19,8 @@ from level1.io.message import from_message
 if TYPE_CHECKING:
     import can
 
+LATEST_S = 1 << 33
+"""Time stamps from here on, in the year 2242, are none."""
 HOPELESS_LINES = 1000
 """A file whose first so many lines are all unreadable is given up."""
 
@@ -160,7 +162,7 @@ def _absolute(lines: Iterable[Line]) -> Iterator[Line]:
 
 def stamp_ns(stamp_s: float) -> int:
     """A floating-point stamp of seconds in ns, rounded to the microsecond. Raises ValueError when it can't be one."""
-    if not 0 <= stamp_s < 2**33:
+    if not 0 <= stamp_s < LATEST_S:
         raise ValueError(f"time stamp {stamp_s} out of range")
     return round(stamp_s * 1_000_000) * 1000
 
