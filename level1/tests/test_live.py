@@ -19,7 +19,7 @@ from level1.catalog import Catalog
 from level1.command import Order
 from level1.decode import encode
 from level1.event import Commanded, Event, Monitor, Result, Send, SentFrame
-from level1.frame import ERROR, EXTENDED, Frame, Row, frame_key
+from level1.frame import ERROR, EXTENDED, REMOTE, Frame, Row, frame_key
 from level1.gate import Gate
 from level1.health import Reading
 from level1.io import live
@@ -378,6 +378,22 @@ class TestSending:
             port.send(send(0, 10, number), 0)
         assert [bytes(sent.data)[0] for sent in wire.sent] == [0, 1, 2]
         assert port.flush(0) is None and port.counters == {"sent": 3}
+
+    def test_the_question_of_node_guarding_is_a_remote_frame(self) -> None:
+        wire = Wire()
+        self.port(wire).send(Send(0, frame_key(0x72A, False) | REMOTE, b"\0", "node guarding", "CANopen", 10), 0)
+        sent, = wire.sent
+        assert (sent.arbitration_id, sent.is_remote_frame, sent.dlc, sent.is_extended_id) == (0x72A, True, 1, False)
+
+    def test_a_driver_that_hangs_holds_nobody_up_and_what_it_sends_at_last_is_sent_once(self) -> None:
+        hangs = threading.Event()
+        wire = Wire(send=lambda _: None if hangs.wait(WAIT_S) else None)
+        port = self.port(wire)
+        port.send(send(0, 10, 1), 0)
+        assert port.flush(0) is not None and wire.sent == []
+        hangs.set()
+        until(lambda: port.flush(0) is None)
+        assert [bytes(sent.data)[0] for sent in wire.sent] == [1] and port.counters == {"sent": 1}
 
     @pytest.mark.parametrize("full", [
         can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS),

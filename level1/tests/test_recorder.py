@@ -93,7 +93,7 @@ def test_what_was_received_and_sent_on_all_buses_can_be_read_again(bench: Callab
         Frame(START_NS + 5 * MS, frame_key(0x7FF, False), b"")]
     one.recorder.record(frames)
     one.recorder.record([Send(START_NS + 6 * MS, frame_key(0x110, False), b"\5", "FLAMER_CMD", "repair", START_NS + S),
-                         Send(START_NS + 7 * MS, frame_key(0x72A, False) | REMOTE, b"\0", "node guarding", "CANopen", START_NS + S)])
+                         Send(START_NS + 7 * MS, frame_key(0x72A, False) | REMOTE, b"\0", "guarding", "CANopen", START_NS + S)])
     one.until(one.drained)
     one.recorder.stop()
     log = Log(one.files()[0])
