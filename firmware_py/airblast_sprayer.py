@@ -19,6 +19,7 @@ from firmware_py.airblast_plant import AirblastPlant
 from firmware_py.canopen_node import CANOPEN_FAULTS, CanopenNode
 from firmware_py.codec import Codec, Value
 from firmware_py.fault import WORKS, Phrase, Statement
+from firmware_py.node import WRONG_COUNTER
 from firmware_py.quantity import Setting
 from firmware_py.ultrasonic_sensors import COLUMN, NO_ECHO, SENSORS
 
@@ -38,6 +39,7 @@ EMPTY_PERCENT, FILLED_PERCENT = 1.0, 5.0
 UPPER, LOWER = (0, 4), (3, 7)
 """Nozzles that turn, by index."""
 ANGLES = {0: "AngleLeftUpper", 3: "AngleLeftLower", 4: "AngleRightUpper", 7: "AngleRightLower"}
+DRIFT_PERCENT_S, SLOW = 3.0, 8
 COMMANDS_LOST, TANK_EMPTY = 0x8250, 0xFF10
 """Error codes."""
 IDLE: dict[str, Value] = {"AirblastWanted": "Off", "NozzleMode": "Automatic", "TurnMode": "Automatic", "Retry": "Off",
@@ -65,6 +67,10 @@ class AirblastSprayer(CanopenNode):
         Phrase("line", WORKS, "it flows again", lasts=False),
         Phrase("", "refuses start", "does not start", counted=True),
         Phrase("", "refuses stop", "does not stop", counted=True),
+        Phrase("", "slow", f"takes {SLOW} times as long to start and to stop"),
+        Phrase("level_sensor", "drifts down", f"reads {DRIFT_PERCENT_S:g} % less each second"),
+        Phrase("level_sensor", WORKS, "reads right", lasts=False),
+        WRONG_COUNTER,
         *CANOPEN_FAULTS,
     )
     SETTINGS: ClassVar[tuple[Setting, ...]] = (
@@ -82,6 +88,7 @@ class AirblastSprayer(CanopenNode):
         self._nozzles = tuple(Actuator("Closed", round(random.uniform(*NOZZLE_RESPONSE_S) * 1e9)) for _ in range(NOZZLES))
         self._angles = dict.fromkeys(ANGLES, 0.0)
         self._opens_left: int | None = None
+        self._drifts_ns: int | None = None
         self._counter = 0
         self._forget()
         self._told = self._look()
@@ -202,13 +209,18 @@ class AirblastSprayer(CanopenNode):
     def values(self, message: str) -> Mapping[str, Value]:
         """What the sensors say now."""
         if message == "AIRBLAST_STATUS":
-            self._counter = (self._counter + 1) % 16
+            self._counter = self.count(self._counter)
             return {"Airblast": "On" if self._mode.position == "On" and self._valve.position == "Open" else "Off",
                     "MainValve": self._valve.position, "AirblastState": self._state,
                     **{f"Nozzle{number}": nozzle.position for number, nozzle in enumerate(self._nozzles, 1)},
                     **{name: round(self._angles[index]) for index, name in ANGLES.items()}, "AirblastCounter": self._counter}
         return {"AirblastFlow": round(self.plant.shown_l_min, 2), "AirblastPressure": round(self.plant.bar, 2),
-                "AirblastTankLevel": round(2 * self.plant.shown_percent) / 2, "AirblastSprayed": round(self.plant.sprayed_l, 1)}
+                "AirblastTankLevel": round(2 * max(0.0, self.plant.shown_percent - self._drift_percent)) / 2,
+                "AirblastSprayed": round(self.plant.sprayed_l, 1)}
+
+    @property
+    def _drift_percent(self) -> float:
+        return 0.0 if self._drifts_ns is None else DRIFT_PERCENT_S * (self._next_tick_ns - self._drifts_ns) / 1e9
 
     def reboot(self, t_ns: int) -> None:
         """The program begins anew: off, and nothing heard."""
@@ -224,17 +236,22 @@ class AirblastSprayer(CanopenNode):
             case "line", action:
                 self.plant.blocked = action == "blocked"
                 self._opens_left = statement.commands
+            case "level_sensor", action:
+                self._drifts_ns = None if action == WORKS else now_ns
             case "", "refuses start":
                 self._mode.jam(("On",), statement.commands)
             case "", "refuses stop":
                 self._mode.jam(("Off",), statement.commands)
+            case "", "slow":
+                self._mode.response_ns = SLOW * MODE_NS
             case _:
                 super().fault(now_ns, statement)
 
     def inject(self, now_ns: int, statement: Statement) -> None:
-        """One of `FAULTS`; `works` without a device also ends a refusal to start or stop."""
+        """One of `FAULTS`; `works` without a device also ends what it does with starts and stops."""
         super().inject(now_ns, statement)
         if statement == Statement("", None, WORKS):
+            self._mode.response_ns = MODE_NS
             self._mode.release()
 
     # --- story ------------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from firmware_py.actuator import Actuator
 from firmware_py.codec import Codec, Value
 from firmware_py.fault import WORKS, Phrase, Statement
 from firmware_py.flaming_plant import LEAK, Bottle, FlamingPlant, Hazard, Wind
-from firmware_py.node import COMMON_FAULTS, Node
+from firmware_py.node import BABBLING, COMMON_FAULTS, WRONG_COUNTER, Node
 from firmware_py.quantity import Setting
 from firmware_py.safeguard import Safeguard
 
@@ -24,6 +24,8 @@ VALVE_NS = 40_000_000
 MODE_NS = 100_000_000
 """Response time of the work-mode relay."""
 BURNER_RESPONSE_S = (0.2, 0.6)
+SLOW = 6
+DRIFT_NS = 30_000_000_000
 """Response time of a burner's valves; each burner has its own."""
 SENSOR_ON_NS = 300_000_000
 SENSOR_OFF_NS = 200_000_000
@@ -82,15 +84,20 @@ class FlamingTool(Node):
         Phrase("burner", "stuck off", "does not open, once it is closed", count=BURNERS, counted=True),
         Phrase("burner", "stuck low", "stays at low pressure, once it is there", count=BURNERS, counted=True),
         Phrase("burner", "stuck high", "stays at high pressure, once it is there", count=BURNERS, counted=True),
+        Phrase("burner", "slow", f"needs {SLOW} times as long", count=BURNERS),
         Phrase("burner", WORKS, "moves again", count=BURNERS, lasts=False),
         Phrase("", "refuses start", "does not start flaming", counted=True),
         Phrase("", "refuses stop", "does not stop flaming", counted=True),
         Phrase("bottle", "empty", "all gas is gone", lasts=False),
         Phrase("bottle", "changed", "someone brings a full one", lasts=False),
+        Phrase("bottle_sensor", "drifts down", "reads a bottle that runs empty in 30 s, level and pressure"),
+        Phrase("bottle_sensor", WORKS, "reads right", lasts=False),
         Phrase("flame_sensor", "stuck on", "always sees a flame"),
         Phrase("flame_sensor", "stuck off", "never sees a flame"),
         Phrase("flame_sensor", WORKS, "sees what there is", lasts=False),
         Phrase("wind", "gust", "one gust of the strength set", lasts=False),
+        BABBLING,
+        WRONG_COUNTER,
         *COMMON_FAULTS,
     )
     SETTINGS: ClassVar[tuple[Setting, ...]] = (
@@ -114,7 +121,9 @@ class FlamingTool(Node):
         self._sensor = FlameSensor(start_ns)
         self._valve = Actuator("Closed", VALVE_NS)
         self._mode = Actuator("Off", MODE_NS)
-        self._burners = tuple(Actuator("Off", round(random.uniform(*BURNER_RESPONSE_S) * 1e9)) for _ in range(BURNERS))
+        self._responses_ns = tuple(round(random.uniform(*BURNER_RESPONSE_S) * 1e9) for _ in range(BURNERS))
+        self._burners = tuple(Actuator("Off", response_ns) for response_ns in self._responses_ns)
+        self._drifts_ns: int | None = None
         self._igniter_dead = False
         self._leaks = False
         self._command: Mapping[str, Value] = IDLE
@@ -198,7 +207,7 @@ class FlamingTool(Node):
         """What the sensors say now."""
         match message:
             case "FLAMER_STATUS":
-                self._alive = (self._alive + 1) % 16
+                self._alive = self.count(self._alive)
                 return {
                     "Flaming": self._mode.position, "PilotFlame": "On" if self._sensor.sees else "Off",
                     "GasValve": self._valve.position, "GasValveDemand": self.safeguard.valve,
@@ -208,9 +217,16 @@ class FlamingTool(Node):
             case "FLAMER_BURNERS":
                 return {f"Burner{number}": burner.position for number, burner in enumerate(self._burners, 1)}
             case _:
-                bottle = self.plant.bottle
-                return {"BottlePressure": round(bottle.bar, 2), "BottleLevel": round(2 * bottle.level_percent) / 2,
+                bottle, right = self.plant.bottle, self._right
+                return {"BottlePressure": round(bottle.bar * right, 2), "BottleLevel": round(2 * bottle.level_percent * right) / 2,
                         "BottleTemperature": round(bottle.celsius), "GasUsed": round(bottle.gas_used_kg, 3)}
+
+    @property
+    def _right(self) -> float:
+        """The part that the bottle's sensors tell of what there is."""
+        if self._drifts_ns is None:
+            return 1.0
+        return max(0.0, 1 - (self._next_tick_ns - self._drifts_ns) / DRIFT_NS)
 
     def restart(self, t_ns: int) -> None:
         """Protocol begins anew; what was driven falls back to closed and off."""
@@ -234,7 +250,12 @@ class FlamingTool(Node):
             case "burner", action:
                 chosen = self._burners if statement.index is None else (self._burners[statement.index - 1],)
                 for burner in chosen:
-                    _jam_burner(burner, action, statement.commands)
+                    if action in ("slow", WORKS):
+                        burner.response_ns = self._responses_ns[self._burners.index(burner)] * (SLOW if action == "slow" else 1)
+                    if action != "slow":
+                        _jam_burner(burner, action, statement.commands)
+            case "bottle_sensor", action:
+                self._drifts_ns = None if action == WORKS else now_ns
             case "", "refuses start":
                 self._mode.jam(("On",), statement.commands)
             case "", "refuses stop":

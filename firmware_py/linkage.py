@@ -17,12 +17,13 @@ PTO_ON_RPM, PTO_OFF_RPM = 250.0, 20.0
 
 
 class Hitch:
-    """The three-point hitch. position: 0 % lowered, 100 % raised. target: where it was told to go last."""
+    """The three-point hitch. position: 0 % lowered, 100 % raised. target: where it was told to go last. part: of its speed."""
 
     def __init__(self, position: float):
         self.position = position
         self.target = position
         self.state = "Still"
+        self.part = 1.0
         self._moves = False
         self._jammed = False
         self._refusals: int | None = None
@@ -36,7 +37,7 @@ class Hitch:
             self._moves = self._try()
         self.state = "Still"
         if self._moves:
-            step = HITCH_PERCENT_S * dt_s
+            step = HITCH_PERCENT_S * self.part * dt_s
             before = self.position
             self.position += min(step, max(-step, self.target - before))
             self.state = "Raising" if self.position > before else "Lowering" if self.position < before else "Still"

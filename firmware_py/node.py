@@ -26,6 +26,9 @@ COMMON_FAULTS = (
     Phrase("", "reset", f"is off for {BOOT_NS / 1e9:g} s and starts anew", lasts=False),
     Phrase("", WORKS, "ends the faults above", lasts=False),
 )
+BABBLING = Phrase("", "babbling", "sends everything at every tick")
+WRONG_COUNTER = Phrase("", "wrong counter", "the counter of its status stands still, the rest is right")
+"""Faults that every node knows, but tells only where no subclass has another kind of them."""
 
 
 class Node:
@@ -53,6 +56,7 @@ class Node:
         self.short_frames = 0
         self._frozen = False
         self._silent = False
+        self._floods = self._miscounts = False
         self._next_tick_ns = start_ns
         self._boots_ns: int | None = None
         self._due_ns = dict.fromkeys(self.SENDS, start_ns)
@@ -98,6 +102,8 @@ class Node:
             self.tick(t_ns)
             if t_ns >= self._first_due_ns:
                 self._fall_due(t_ns, due)
+        if self._floods:
+            due = dict.fromkeys(self.SENDS)
         if not due:
             return []
         return [frame for message in due if (frame := self._frame(message)) is not None]
@@ -151,7 +157,7 @@ class Node:
                 self._boots_ns = now_ns + BOOT_NS
                 self.powered = False
             case "works":
-                self._silent = self._frozen = False
+                self._silent = self._frozen = self._floods = self._miscounts = False
             case _:
                 self.fault(now_ns, statement)
 
@@ -165,7 +171,7 @@ class Node:
         self._boots_ns = None
         self.powered = True
         self._sent.clear()
-        self._silent = self._frozen = False
+        self._silent = self._frozen = self._floods = self._miscounts = False
         self.restart(t_ns)
         self.tell(t_ns, "starts anew")
 
@@ -206,4 +212,14 @@ class Node:
 
     def fault(self, now_ns: int, statement: Statement) -> None:
         """Make one of the node's own faults happen. Raises ValueError for one it doesn't know."""
-        raise ValueError(f"{self.name} knows no fault {statement}")
+        match statement.device, statement.action:
+            case "", BABBLING.action:
+                self._floods = True
+            case "", WRONG_COUNTER.action:
+                self._miscounts = True
+            case _:
+                raise ValueError(f"{self.name} knows no fault {statement}")
+
+    def count(self, counter: int) -> int:
+        """What a counter of 4 bits says after this value."""
+        return counter if self._miscounts else (counter + 1) % 16

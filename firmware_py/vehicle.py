@@ -30,7 +30,7 @@ from firmware_py.fault import WORKS, Phrase, Statement
 from firmware_py.field import to_degrees
 from firmware_py.linkage import Hitch, Pto
 from firmware_py.nmea import sentences
-from firmware_py.node import COMMON_FAULTS, Node
+from firmware_py.node import BABBLING, COMMON_FAULTS, WRONG_COUNTER, Node
 from firmware_py.participant import BusFrame
 from firmware_py.quantity import Setting
 
@@ -41,6 +41,7 @@ POSITION_TIMEOUT_NS = 1_000_000_000
 NOT_MOVING_NS = 10_000_000_000
 MOVES_M_S = 0.03
 IMPLEMENT_NS = 2_000_000_000
+SLOW, DRIFT_M_S = 3, 0.05
 ALTITUDE_M = 650.0
 ACCURACY_M = {"RtkFixed": 0.01, "RtkFloat": 0.4}
 UTC_START_NS = 1_775_030_400_000_000_000
@@ -87,11 +88,13 @@ class Vehicle(Node):
         Phrase("wheels", "blocked", "the wheels can't turn"),
         Phrase("wheels", WORKS, "turn again", lasts=False),
         Phrase("hitch", "stuck", "stays where it is", counted=True),
+        Phrase("hitch", "slow", "moves at a third of its speed"),
         Phrase("hitch", WORKS, "moves again", lasts=False),
         Phrase("pto", "refuses", "its clutch does not engage", counted=True),
         Phrase("pto", "stays on", "its clutch does not let go", counted=True),
         Phrase("pto", WORKS, "engages and lets go again", lasts=False),
         Phrase("implement", "refuses", "is not set or unset", counted=True),
+        Phrase("implement", "slow", "takes three times as long"),
         Phrase("implement", WORKS, "is set and unset again", lasts=False),
         Phrase("oil_sensor", "unplugged", "oil pressure reads error, DM1 says SPN 100 FMI 4"),
         Phrase("oil_sensor", WORKS, "is plugged in again", lasts=False),
@@ -101,12 +104,15 @@ class Vehicle(Node):
         Phrase("alternator", WORKS, "charges again", lasts=False),
         Phrase("gnss", "lost", "no position"),
         Phrase("gnss", "float", "RTK without fixed ambiguities: some decimetres"),
+        Phrase("gnss", "drifts", f"RTK fixed, says the receiver, but {100 * DRIFT_M_S:g} cm more to the east each second"),
         Phrase("gnss", WORKS, "RTK fixed again", lasts=False),
         Phrase("stop_switch", "pressed", "somebody presses it"),
         Phrase("stop_switch", WORKS, "is released; the vehicle stays stopped", lasts=False),
         Phrase("path", "loaded", "somebody brings it back to the start of its path and loads the mission anew", lasts=False),
         Phrase("start_button", "pressed", "somebody at the machine ends a stop", lasts=False),
         Phrase("", "manual", "somebody takes the wheel"),
+        BABBLING,
+        WRONG_COUNTER,
         *COMMON_FAULTS,
     )
     SETTINGS: ClassVar[tuple[Setting, ...]] = (
@@ -148,6 +154,7 @@ class Vehicle(Node):
         self._released = dict.fromkeys(HARMLESS, False)
         self._paused_from = "Ready"
         self._hitch_held = True
+        self._drifts_ns: int | None = None
         self._unplugged = False
         self._codes = 0
         self._pressed = False
@@ -309,7 +316,8 @@ class Vehicle(Node):
             self.nmea(sentence)
 
     def _place(self) -> tuple[float, float]:
-        return to_degrees(self.drive.pose.x_m, self.drive.pose.y_m)
+        drift_m = 0.0 if self._drifts_ns is None else DRIFT_M_S * (self._now_ns - self._drifts_ns) / 1e9
+        return to_degrees(self.drive.pose.x_m + drift_m, self.drive.pose.y_m)
 
     # --- what it says -----------------------------------------------------------------------------------------------------
 
@@ -336,7 +344,7 @@ class Vehicle(Node):
         """What the sensors say now."""
         match message:
             case "VEHICLE_STATUS":
-                self._counter = (self._counter + 1) % 16
+                self._counter = self.count(self._counter)
                 return {"Controller": self.controller, "StopReason": self.reason, "MissionState": self.mission,
                         "EngineState": "Running" if self.engine.running and self.engine.rpm > RUNS_RPM else "Off",
                         "PathPart": "Turn" if self.drive.pose.turning else "Straight",
@@ -449,12 +457,18 @@ class Vehicle(Node):
                 self.engine.die() if action == "dies" else self.engine.start()
             case "wheels", action:
                 self.drive.blocked = action == "blocked"
+            case "hitch", "slow":
+                self.hitch.part = 1 / SLOW
             case "hitch", action:
+                self.hitch.part = 1.0
                 self.hitch.release() if action == WORKS else self.hitch.jam(statement.commands)
             case "pto", action:
                 refused = {"refuses": ("On",), "stays on": ("Off",)}.get(action)
                 self.pto.clutch.release() if refused is None else self.pto.clutch.jam(refused, statement.commands)
+            case "implement", "slow":
+                self.implement.response_ns = SLOW * IMPLEMENT_NS
             case "implement", action:
+                self.implement.response_ns = IMPLEMENT_NS
                 self.implement.release() if action == WORKS else self.implement.jam(None, statement.commands)
             case "oil_sensor", action:
                 self._unplugged = action == "unplugged"
@@ -466,6 +480,7 @@ class Vehicle(Node):
             case "alternator", action:
                 self.engine.alternator = action == WORKS
             case "gnss", action:
+                self._drifts_ns = now_ns if action == "drifts" else None
                 self.fix = {"lost": "NoFix", "float": "RtkFloat"}.get(action, "RtkFixed")
             case "stop_switch", action:
                 self._pressed = action == "pressed"

@@ -153,3 +153,15 @@ def test_every_phrase_of_every_program_can_be_written() -> None:
             text = f'faults = ["at 1 s: {subject}{index} {phrase.action}"]\n[nodes.node]\nprogram = "{program}"\n'
             (step, *_) = parse(text, "test.toml").steps
             assert step.statement.action == phrase.action
+
+
+KINDS = ("stuck blocked", "slow", "refuses", "drifts", "silent", "frozen", "babbling", "wrong counter", "reset")
+"""What a machine does wrong; the first: either word."""
+
+
+@pytest.mark.parametrize("program", ["flaming_tool", "sprayer_boom", "airblast_sprayer", "vehicle"])
+def test_every_machine_knows_every_kind_of_fault(program: str) -> None:
+    said = [phrase.action for phrase in PROGRAMS[program].FAULTS]
+    words = {word for action in said for word in action.split()}
+    assert [kind for kind in KINDS if kind not in said and not words & set(kind.split())] == []
+    assert len({(phrase.device, phrase.action) for phrase in PROGRAMS[program].FAULTS}) == len(said), "each is told once"

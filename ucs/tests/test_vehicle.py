@@ -231,8 +231,10 @@ TABLE: list[tuple[str, list[str], list[str], set[str] | None]] = [
     ("ImplementSetUnsetFailure", ["at 50 s: tractor.implement refuses for 1 command"], REPAIRED, {"ImplementSetUnsetFailure"}),
     ("ImplementSetUnsetFailure", ["at 0 s: tractor.implement refuses"],
      ["raised", *["repair_started", "repair_failed"] * 3, "locked_out"], {"ImplementSetUnsetFailure"}),
+    ("ImplementSetUnsetFailure", ["at 0 s: tractor.implement slow for 40 s"], REPAIRED, {"ImplementSetUnsetFailure"}),
     ("VehicleSilent", ["at 20 s: tractor silent for 5 s"], ["raised", "cleared"], None),
     ("VehicleFrozen", ["at 20 s: tractor frozen for 5 s"], ["raised", "cleared"], {"VehicleFrozen", "VehicleCommandsLost"}),
+    ("VehicleFrozen", ["at 20 s: tractor wrong counter for 5 s"], ["raised", "cleared"], {"VehicleFrozen"}),
     ("VehicleCommandsLost", ["at 20 s: mission silent for 3 s"], ["raised"], {"VehicleCommandsLost"}),
     ("VehicleCommandsLost", ["at 20 s: mission frozen for 3 s"], ["raised"], {"VehicleCommandsLost"}),
     ("PositionLost", ["at 20 s: tractor.gnss lost for 10 s"], ["raised", "cleared"], {"PositionLost"}),
@@ -263,6 +265,7 @@ def test_every_alarm_of_the_definition_is_raised_by_some_fault() -> None:
 
 @pytest.mark.parametrize("fault", [
     "at 20 s: tractor silent for 600 ms", "at 20 s: mission silent for 300 ms", "at 20 s: tractor.gnss lost for 300 ms",
+    "at 0 s: tractor.hitch slow", "at 20 s: tractor babbling for 5 s", "at 20 s: tractor.gnss drifts for 20 s",
     "at 20 s: tractor.wheels blocked for 2 s", "at 20 s: tractor.gnss float for 3 s"])
 def test_what_is_within_the_allowances_raises_nothing(catalog: Catalog, fault: str) -> None:
     assert farm(catalog, fault, duration="1 min").run().events == []
