@@ -11,11 +11,15 @@ Input = tuple[str, str]
 """Message and signal; the signal is "" where the message as a whole is asked for."""
 
 
-def of_alarm(alarm: Alarm) -> list[Input]:
-    """Inputs of an alarm's conditions and of what its repair expects, in the order of the text, each once."""
+def of_alarm(alarm: Alarm, *, ages_expected: bool = True) -> list[Input]:
+    """Inputs of an alarm's conditions and of what its repair expects, in the order of the text, each once.
+
+    ages_expected: also signals of which a repair only wants to know how long ago they changed (counters).
+    """
     expected = [step.condition for step in alarm.repair.steps if isinstance(step, ExpectStep)] if alarm.repair else []
-    parts = [part for part in (alarm.when, alarm.until, alarm.enabled, *expected) if part is not None]
-    return list(dict.fromkeys(found for part in parts for found in _of(part)))
+    parts = [part for part in (alarm.when, alarm.until, alarm.enabled) if part is not None]
+    found = [place for part in parts for place in _of(part)] + [place for part in expected for place in _of(part, ages_expected)]
+    return list(dict.fromkeys(found))
 
 
 def messages(catalog: Catalog) -> set[str]:
@@ -23,12 +27,14 @@ def messages(catalog: Catalog) -> set[str]:
     return {message for alarm in catalog.alarms.values() for message, _ in of_alarm(alarm)}
 
 
-def _of(node: Expression) -> Iterator[Input]:
+def _of(node: Expression, ages: bool = True) -> Iterator[Input]:
     match node:
+        case Elapsed() if not ages:
+            return
         case SignalValue() | Rate() | Elapsed() | Quality():
             yield node.message, node.signal
         case Silent():
             yield node.message, ""
         case _:
             for child in children(node):
-                yield from _of(child)
+                yield from _of(child, ages)

@@ -13,12 +13,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from level1.catalog import Alarm, Catalog
-from level1.condition import children
 from level1.event import Event
-from level1.expression import Compare, Expression, SignalValue
 from level1.io.error import OutsideError
-from ucs import inputs
+from ucs import inputs, pairs
 from ucs.inputs import Input
 from ucs.trace import Line, Trace
 
@@ -41,6 +38,7 @@ EXPECTED_STYLE: dict[str, Any] = {"color": EXPECTED, "linestyle": (0, (3, 1.5)),
 LEGEND_COLUMNS, TITLE_LETTERS = 9, 120
 PATH_POINTS, PATH_STEP_POINTS, PATH_MOST_POINTS = 2.5, 2.8, 18.0
 """Line widths on the path: the alarm that stood shortest on top, each below it wider by a step, so that all can be seen."""
+LEGEND_POINTS = 6.0
 LONG_S = 600.0
 """Longer time axes are labelled in minutes."""
 
@@ -145,40 +143,22 @@ def lanes(trace: Trace, alarms: Sequence[str]) -> list[Lane]:
     are compared with what was commanded."""
     catalog, lines = trace.catalog, trace.lines()
     chosen = [catalog.alarms[name] for name in alarms if name in catalog.alarms]
-    own = [place for alarm in chosen for place in inputs.of_alarm(alarm)]
+    own = [place for alarm in chosen for place in inputs.of_alarm(alarm, ages_expected=False)]
     others: list[Input] = []
     if not any(alarm.is_fault for alarm in chosen):
         chosen = list(catalog.alarms.values())
         others = [place for alarm in chosen for place in inputs.of_alarm(alarm) if place in lines and _changes(lines[place])]
-    pairs = [pair for alarm in chosen for pair in sorted(_pairs(alarm, catalog))]
-    partner = {actual: expected for actual, expected in pairs if actual in lines and expected in lines}
+    compared = [pair for alarm in catalog.alarms.values() for pair in sorted(pairs.of_alarm(alarm, catalog))]
+    partner = {actual: expected for actual, expected in compared if actual in lines and expected in lines}
     others.sort(key=lambda place: place not in partner)
     found: dict[Input, Lane] = {}
     for place in (*own, *others):
-        if place in lines and place not in partner.values():
+        place = next((actual for actual, expected in partner.items() if expected == place), place)
+        if place in lines:
             expected = partner.get(place)
             looking = frozenset(alarm.name for alarm in chosen if not {place, expected}.isdisjoint(inputs.of_alarm(alarm)))
             found.setdefault(place, Lane(lines[place], lines[expected] if expected else None, looking))
     return list(found.values())
-
-
-def _pairs(alarm: Alarm, catalog: Catalog) -> set[tuple[Input, Input]]:
-    """Signals that an alarm compares with each other, as (actual, expected): the expected one is the command's."""
-    found = set()
-    for node in _nodes(alarm.when):
-        if isinstance(node, Compare) and isinstance(node.left, SignalValue) and isinstance(node.right, SignalValue):
-            left, right = (node.left.message, node.left.signal), (node.right.message, node.right.signal)
-            commanded = [catalog.messages[name].sent_by_ucs for name, _ in (left, right)]
-            wanted = [any(word in signal for word in ("Wanted", "Demand", "Commanded", "Setpoint")) for _, signal in (left, right)]
-            found.add((right, left) if commanded[0] > commanded[1] or (commanded[0] == commanded[1] and wanted[0] > wanted[1])
-                      else (left, right))
-    return found
-
-
-def _nodes(node: Expression) -> Iterable[Expression]:
-    yield node
-    for child in children(node):
-        yield from _nodes(child)
 
 
 def _changes(line: Line) -> bool:
@@ -190,8 +170,14 @@ def _changes(line: Line) -> bool:
 
 def _states(lane: Lane) -> list[float] | None:
     """The raw values that occur, of a signal with names for them all; None for a number."""
-    values = {value for line in (lane.actual, lane.expected) if line for value in line.values if not math.isnan(value)}
+    values = {value for line in (lane.actual, lane.expected) if line for value in _values(lane, line) if not math.isnan(value)}
     return sorted(values) if values and all(value in lane.actual.signal.choices for value in values) else None
+
+
+def _values(lane: Lane, line: Line) -> list[float]:
+    """The values of a line of a lane; words of the expected signal stand where those of the actual one do."""
+    raws = pairs.translation(lane.actual.signal, line.signal) if line is lane.expected else {}
+    return [raws.get(value, value) for value in line.values]
 
 
 def _lane_height(lane: Lane) -> float:
@@ -207,7 +193,8 @@ def _draw_lane(axis: Any, lane: Lane, origin_ns: int, length_s: float, scale: fl
         if line is None:
             continue
         times = [*((t_ns - origin_ns) / 1e9 / scale for t_ns in line.times_ns), length_s / scale]
-        values = [*line.values, line.values[-1]]
+        values = _values(lane, line)
+        values.append(values[-1])
         if ranks is not None:
             values = [math.nan if math.isnan(value) else ranks[value] for value in values]
         axis.step(times, values, where="post", **style)
@@ -329,7 +316,9 @@ def _draw_path(axis: Any, path: tuple[list[int], list[float], list[float]], told
     axis.set_axisbelow(True)
     axis.tick_params(labelsize=8, length=2)
     axis.margins(0.08)
-    axis.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), fontsize=8, frameon=False, borderaxespad=0)
+    legend = axis.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), fontsize=8, frameon=False, borderaxespad=0)
+    for handle in legend.legend_handles:
+        handle.set_linewidth(min(handle.get_linewidth(), LEGEND_POINTS))
 
 
 def _draw_story(axis: Any, story: Story, times: Sequence[float], place: tuple[Sequence[float], Sequence[float]], colour: str,

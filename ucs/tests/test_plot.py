@@ -14,7 +14,7 @@ from level1.decode import encode
 from level1.event import Event
 from level1.frame import Frame, frame_key
 from level1.io.definitions import load
-from ucs import main
+from ucs import main, pairs
 from ucs.plot import MOST_ALARMS, draw, lanes, stories
 from ucs.trace import Trace
 
@@ -129,3 +129,28 @@ def test_what_stands_in_the_way_is_one_line_and_said_before_the_work(ucs: Run, t
     assert "the picture can't be written: Format 'doc' is not supported" in ucs(*words, tmp_path / "x.doc")[2]
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert ucs(*words, tmp_path / "x.png") == (2, "", "ucs: --plot needs a package more: pip install 'tractor-ucs[plot]'\n")
+
+
+@pytest.mark.parametrize(("file", "alarm", "pairs_of_it"), [
+    ("sprayer_boom.dbc", "Section7NotSet", {("Valve7", "Valve7Wanted")}),
+    ("sprayer_boom.dbc", "MainFlowNotAdjusted", {("MainFlow", "MainFlowTarget")}),
+    ("sprayer_boom.dbc", "MainTankMismatch", set()),
+    ("sprayer_boom.dbc", "BoomOpeningNotAdjusted", set()),
+    ("vehicle.dbc", "HitchNotMoving", {("HitchPosition", "HitchWanted")}),
+    ("vehicle.dbc", "PtoNotSet", {("PtoState", "PtoWanted")}),
+    ("vehicle.dbc", "ImplementSetUnsetFailure", {("ImplementState", "ImplementWanted")}),
+    ("flaming_tool.dbc", "FlamingStartStopFailure", {("Flaming", "Flaming")}),
+    ("flaming_tool.dbc", "PilotFlameOut", set())])
+def test_what_is_and_what_was_expected_of_it_stand_together(file: str, alarm: str, pairs_of_it: set[tuple[str, str]]) -> None:
+    catalog = load([file])
+    found = pairs.of_alarm(catalog.alarms[alarm], catalog)
+    assert {(actual[1], expected[1]) for actual, expected in found} == pairs_of_it
+    assert all(catalog.messages[actual[0]].senders != ("UCS",) for actual, _ in found)
+
+
+def test_an_expected_word_stands_where_the_actual_one_does() -> None:
+    messages = load(["vehicle.dbc"]).messages
+    actual = messages["VEHICLE_IMPLEMENT"].signal("ImplementState")
+    expected = messages["VEHICLE_IMPLEMENT_CMD"].signal("ImplementWanted")
+    assert {expected.choices[int(raw)]: actual.choices[int(same)] for raw, same in pairs.translation(actual, expected).items()} == {
+        "Set": "Set", "Unset": "Unset"}
