@@ -103,3 +103,27 @@ def test_a_missing_interface_and_one_that_is_down_say_what_to_do(
     down = process("run", unit("vcan0"))
     assert down.wait(START_S) == 2
     assert down.err == ["ucs: bus implement: the interface vcan0 is down; bring it up: ip link set vcan0 up"]
+
+
+@pytest.mark.parametrize("away", ["down", "deleted"])
+def test_nodes_on_a_bus_that_goes_away_survive_and_go_on_when_it_is_back(
+        away: str, process: Callable[..., Process], set_link: Callable[[str, bool], None], remake: Callable[[], None]) -> None:
+    node = process("simulate", "healthy.toml", "--bus", "vcan0", "--duration", "1 min")
+    node.expect("flaming on", START_S)
+    set_link("vcan0", False) if away == "down" else remake()
+    node.expect("bus vcan0 is lost .*the nodes live on and try again", 5)
+    set_link("vcan0", True) if away == "down" else remake()
+    node.expect("bus vcan0 is back", 5)
+    message = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
+    with can.Bus(channel="vcan0", interface="socketcan", can_filters=[{"can_id": message.can_id, "can_mask": 0x7FF}]) as bus:
+        assert bus.recv(5) is not None, "it sends again"
+    assert node.stop() == 0
+
+
+def test_nodes_give_up_on_a_bus_that_stays_away_and_say_so(
+        process: Callable[..., Process], set_link: Callable[[str, bool], None]) -> None:
+    node = process("simulate", "healthy.toml", "--bus", "vcan0", "--patience", "1 s")
+    node.expect("flaming on", START_S)
+    set_link("vcan0", False)
+    assert node.wait(10) == 2
+    assert "vcan0" in node.err[-1]
