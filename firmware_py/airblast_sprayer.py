@@ -215,11 +215,12 @@ class AirblastSprayer(CanopenNode):
                     **{f"Nozzle{number}": nozzle.position for number, nozzle in enumerate(self._nozzles, 1)},
                     **{name: round(self._angles[index]) for index, name in ANGLES.items()}, "AirblastCounter": self._counter}
         return {"AirblastFlow": round(self.plant.shown_l_min, 2), "AirblastPressure": round(self.plant.bar, 2),
-                "AirblastTankLevel": round(2 * max(0.0, self.plant.shown_percent - self._drift_percent)) / 2,
+                "AirblastTankLevel": round(2 * max(0.0, self.plant.shown_percent - self.drift_percent)) / 2,
                 "AirblastSprayed": round(self.plant.sprayed_l, 1)}
 
     @property
-    def _drift_percent(self) -> float:
+    def drift_percent(self) -> float:
+        """By how much the level sensor reads too low."""
         return 0.0 if self._drifts_ns is None else DRIFT_PERCENT_S * (self._next_tick_ns - self._drifts_ns) / 1e9
 
     def reboot(self, t_ns: int) -> None:

@@ -217,12 +217,13 @@ class FlamingTool(Node):
             case "FLAMER_BURNERS":
                 return {f"Burner{number}": burner.position for number, burner in enumerate(self._burners, 1)}
             case _:
-                bottle, right = self.plant.bottle, self._right
-                return {"BottlePressure": round(bottle.bar * right, 2), "BottleLevel": round(2 * bottle.level_percent * right) / 2,
+                bottle = self.plant.bottle
+                return {"BottlePressure": round(bottle.bar * self.bottle_told, 2),
+                        "BottleLevel": round(2 * bottle.level_percent * self.bottle_told) / 2,
                         "BottleTemperature": round(bottle.celsius), "GasUsed": round(bottle.gas_used_kg, 3)}
 
     @property
-    def _right(self) -> float:
+    def bottle_told(self) -> float:
         """The part that the bottle's sensors tell of what there is."""
         if self._drifts_ns is None:
             return 1.0

@@ -90,6 +90,10 @@ BOTTLE_LOW = _symptom("BottleLow", 12.0, lambda w, n: w.flamer.talks and w.flame
 GAS_COMMANDS_LOST = _symptom("FlamerCommandsLost", 0.6, lambda w, n: w.flamer.talks
                              and w.flamer.safeguard.state == "CommandsLost")
 FLAMER_QUIET = _symptom("FlamerSilent", 1.4, lambda w, n: not w.flamer.sends)
+TOLD_EMPTY = _symptom("BottleEmpty", 4.5, lambda w, n: w.flamer.talks and w.flamer.plant.bottle.bar * w.flamer.bottle_told < 0.7)
+TOLD_LOW = _symptom("BottleLow", 12.0, lambda w, n: w.flamer.talks
+                    and w.flamer.plant.bottle.level_percent * w.flamer.bottle_told < 14)
+FLAMER_MISCOUNTS = _symptom("FlamerFrozen", 2.0, lambda w, n: w.flamer.talks)
 FLAMER_STANDS = _symptom("FlamerFrozen", 2.0, lambda w, n: w.flamer.sends and not w.flamer.talks)
 
 OUT = ("PilotFlameOut", "PilotFlameTooOften")
@@ -107,6 +111,10 @@ FLAMER: Mapping[str, Row] = {
     "burner stuck off": Row((WRONG_BURNER,)),
     "burner stuck low": Row((WRONG_BURNER,)),
     "burner stuck high": Row((WRONG_BURNER,)),
+    "burner slow": Row((WRONG_BURNER,)),
+    "bottle_sensor drifts down": Row((TOLD_EMPTY, TOLD_LOW)),
+    "babbling": Row(),
+    "wrong counter": Row((FLAMER_MISCOUNTS,)),
     "refuses start": Row((WRONG_MODE,)),
     "refuses stop": Row((WRONG_MODE,)),
     "bottle empty": Row((BOTTLE_EMPTY, BOTTLE_LOW), (*OUT, "PilotIgnitionFailure"), 2 * GAS_TAIL_S),
@@ -289,6 +297,7 @@ STOPPED = _symptom("UnitStopped", 0.9, lambda w, n: w.tractor.talks and w.tracto
                    and w.tractor.reason == "Switch")
 VEHICLE_QUIET = _symptom("VehicleSilent", 1.4, lambda w, n: not w.tractor.sends)
 VEHICLE_STANDS = _symptom("VehicleFrozen", 2.0, lambda w, n: w.tractor.sends and not w.tractor.talks)
+VEHICLE_MISCOUNTS = _symptom("VehicleFrozen", 2.0, lambda w, n: w.tractor.talks)
 VEHICLE_COMMANDS_LOST = _symptom("VehicleCommandsLost", 0.9, lambda w, n: w.tractor.talks
                                  and w.tractor.reason == "CommandsLost")
 
@@ -299,6 +308,11 @@ TRACTOR: Mapping[str, Row] = {
     "engine dies": Row((NOT_MOVING, FLAT), (), 60.0),
     "wheels blocked": Row((NOT_MOVING,)),
     "hitch stuck": Row((HITCH_STANDS,)),
+    "hitch slow": Row(),
+    "implement slow": Row((IMPLEMENT_WRONG,)),
+    "gnss drifts": Row(),
+    "babbling": Row(),
+    "wrong counter": Row((VEHICLE_MISCOUNTS,), DISOBEYED),
     "pto refuses": Row((PTO_NOT_ON,), ("RearPtoNotEngaging",)),
     "pto stays on": Row((PTO_NOT_OFF,)),
     "implement refuses": Row((IMPLEMENT_WRONG,)),
@@ -335,8 +349,15 @@ def _wrong_airblast(w: World, n: int) -> bool:
             and w.airblast.state not in ("TankEmpty", "CommandsLost"))
 
 
+def _airblast_told_percent(w: World) -> float:
+    return w.airblast.plant.level_percent - w.airblast.drift_percent
+
+
 AIRBLAST_EMPTY = _symptom("AirblastTankCritical", 5.0, lambda w, n: _tells(w) and w.airblast.plant.level_percent < 4)
 AIRBLAST_LOW = _symptom("AirblastTankLow", 12.0, lambda w, n: _tells(w) and w.airblast.plant.level_percent < 14)
+AIRBLAST_TOLD_EMPTY = _symptom("AirblastTankCritical", 5.0, lambda w, n: _tells(w) and _airblast_told_percent(w) < 4)
+AIRBLAST_TOLD_LOW = _symptom("AirblastTankLow", 12.0, lambda w, n: _tells(w) and _airblast_told_percent(w) < 14)
+AIRBLAST_MISCOUNTS = _symptom("AirblastFrozen", 2.2, lambda w, n: _tells(w))
 NO_FLOW = _symptom("NoMainFlow", 3.6, lambda w, n: _tells(w) and w.airblast.works and w.airblast.plant.level_percent >= 6
                    and w.airblast.plant.flow_l_min < 1.8)
 WRONG_AIRBLAST = _symptom("AirblastStartStopFailure", 3.7, _wrong_airblast)
@@ -360,6 +381,9 @@ AIRBLAST: Mapping[str, Row] = {
     "line blocked": Row((NO_FLOW,)),
     "refuses start": Row((WRONG_AIRBLAST,)),
     "refuses stop": Row((WRONG_AIRBLAST,)),
+    "slow": Row((WRONG_AIRBLAST,)),
+    "level_sensor drifts down": Row((AIRBLAST_TOLD_EMPTY, AIRBLAST_TOLD_LOW)),
+    "wrong counter": Row((AIRBLAST_MISCOUNTS,)),
     "emergency": Row((AIRBLAST_EMERGENCY,)),
     "babbling": Row((AIRBLAST_BABBLES,), ("AirblastFrozen",)),
     "heartbeat off": Row((AIRBLAST_NO_HEARTBEAT,), ("DeviceSilent",)),
