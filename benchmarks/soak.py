@@ -1,4 +1,4 @@
-"""Nothing lost, no stranger obeyed, at length: `python -m benchmarks.soak` (about ten minutes; `--quick` about one).
+"""Nothing lost, no stranger obeyed, at length: `python -m benchmarks.soak` (about a quarter of an hour, and Go for NATS; `--quick`: a tenth).
 
 Each trial counts what went in and what came out; `--write` puts the counts into docs/reliability.md. Exit status 1 when a count
 is not what it has to be.
