@@ -15,7 +15,7 @@ help:
 	@echo "make test-wheel  the unit tests against the built and installed wheel"
 	@echo "make golden      declare the events that the examples give now (see examples/README.md)"
 	@echo "make coverage    write docs/coverage.md: which tests prove which line of the specification"
-	@echo "make soak        kills, power cuts, forged commands and pulled plugs at length: about 17 minutes"
+	@echo "make soak        kills, power cuts, forged commands, NATS and pulled plugs at length: about 25 minutes; needs Go"
 	@echo "make season      1,000 h of virtual time with random faults: hours; goes on where it was stopped"
 	@echo "make clean       remove what these made"
 

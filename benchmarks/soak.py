@@ -1,4 +1,4 @@
-"""Nothing lost, no stranger obeyed, at length: `python -m benchmarks.soak` (about a quarter of an hour, and Go for NATS; `--quick`: a tenth).
+"""Nothing lost, no stranger obeyed, at length: `python -m benchmarks.soak` (a quarter of an hour; `--quick`: a tenth). Needs Go.
 
 Each trial counts what went in and what came out; `--write` puts the counts into docs/reliability.md. Exit status 1 when a count
 is not what it has to be.
@@ -225,6 +225,7 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
     parser.add_argument("--seed", type=int, default=1, help="of the dice (default %(default)s)")
     args = parser.parse_args()
+    nats.server()  # built before anything else: without Go it is said now, not in the end
     share = 10 if args.quick else 1
     dice = random.Random(args.seed)
     trials: list[tuple[Callable[[int, random.Random], Row], int]] = [
