@@ -37,7 +37,7 @@ def ours(log: str, dbc: str, blocks: bool = True) -> Outcome:
     from level1.event import encode
     from level1.io import definitions
     from level1.io.replay import Log
-    from ucs.replay import Replay
+    from ucs.recording import Replay
     catalog = definitions.load([dbc])
     alarms: list[AlarmLine] = []
     replay = Replay(Log(log, one_bus=True), catalog, None, blocks=blocks)

@@ -19,7 +19,7 @@ from level1.catalog import Catalog
 from level1.event import Event, seconds
 from level1.io import definitions
 from level1.io.replay import Log, LogError
-from ucs.replay import Replay
+from ucs.recording import Replay
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data"

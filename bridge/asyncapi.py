@@ -1,4 +1,4 @@
-"""The AsyncAPI 3.0 description of what goes over MQTT: `bridge/schema/asyncapi.json`, written by `python -m bridge.wire`."""
+"""The AsyncAPI 3.0 description of what goes over MQTT: `bridge/schema/asyncapi.json`, written by `python -m bridge.contract`."""
 from __future__ import annotations
 
 import inspect

@@ -1,18 +1,14 @@
 """What goes over MQTT between a unit and level 2: topics and messages (DESIGN §6). The contract for any other level 2.
 
 A topic is `ucs/v1/<fleet>/<unit>/<kind>`, for monitoring `…/monitor/<message>`. A payload is one JSON object of the type
-that `KINDS` names; `bridge/schema/` holds their JSON Schema files, written by `python -m bridge.wire`. A reader ignores
+that `KINDS` names; `bridge/schema/` holds their JSON Schema files, written by `python -m bridge.contract`. A reader ignores
 fields it doesn't know and refuses a `schema` above its own.
 """
 from __future__ import annotations
 
 import hashlib
-import inspect
 import re
-import sys
-from collections.abc import Sequence
 from decimal import Decimal
-from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import msgspec
@@ -279,33 +275,6 @@ def digest(payload: bytes) -> str:
     return hashlib.sha256(payload).hexdigest()
 
 
-def schemas() -> dict[str, str]:
-    """JSON Schema (draft 2020-12) of every message and the AsyncAPI description of all, by the name of its file."""
-    from bridge.asyncapi import describe
-    found = {f"{name}.json": _schema(name, kind) for name, kind in SCHEMAS.items()}
-    return found | {"asyncapi.json": msgspec.json.format(msgspec.json.encode(describe()), indent=2).decode() + "\n"}
-
-
-def _schema(name: str, kind: type[msgspec.Struct]) -> str:
-    generated = _readable(msgspec.json.schema(kind))
-    own = generated["$defs"].pop(kind.__name__)
-    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": f"urn:ucs:v{SCHEMA}:{name}"}
-    text = msgspec.json.encode({**head, **own, **({"$defs": generated["$defs"]} if generated["$defs"] else {})})
-    return msgspec.json.format(text, indent=2).decode() + "\n"
-
-
-def _readable(schema: Any) -> Any:
-    """The schema with decimals as the JSON numbers they are sent as, and docstrings without their indentation."""
-    if isinstance(schema, list):
-        return [_readable(item) for item in schema]
-    if not isinstance(schema, dict):
-        return schema
-    if schema.get("format") == "decimal":
-        return {"type": "number"} | {key: schema[key] for key in schema.keys() - {"type", "format"}}
-    return {key: inspect.cleandoc(item) if key == "description" and isinstance(item, str) else _readable(item)
-            for key, item in schema.items()}
-
-
 def _is_plain(number: Decimal) -> bool:
     """Whether a number can be printed and reckoned with: `1E999999999` would fill the memory with its digits."""
     digits, exponent = number.as_tuple()[1:]
@@ -318,17 +287,3 @@ def _too_new(payload: bytes) -> str:
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return ""
     return f"schema {version} is newer than {SCHEMA}, which this version knows; update it" if version > SCHEMA else ""
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Write the JSON Schema files into the folder given, or beside this module."""
-    folder = Path(arguments[0]) if arguments else Path(__file__).parent / "schema"
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, text in schemas().items():
-        (folder / name).write_text(text, encoding="utf-8")
-        print(folder / name)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -21,10 +21,10 @@ from level1.board import Board, Cell, Page, Watch, Watchdog
 from level1.column_condition import ColumnCondition
 from level1.columns import Column, changed_payloads
 from level1.decode import OLD
+from level1.plan import Node, Plan
 from level1.timer import FAR
 
 if TYPE_CHECKING:
-    from level1.sieve import Node, Plan
     from level1.supervisor import Supervisor
 
 NOBODY, FED = -1, -2

@@ -18,7 +18,6 @@ This module holds what stays from block to block.
 """
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -28,14 +27,14 @@ from level1.block import Block, Ints
 from level1.board import MAX_KEYS, Cell, Page, Watch
 from level1.catalog import Catalog
 from level1.column_condition import ColumnCondition, compile_zone
-from level1.columns import Bits, Column, SignalColumn, Unsupported
+from level1.columns import Column, Unsupported
 from level1.condition import walk
-from level1.decode import last_byte, raw_range
 from level1.event import Output
 from level1.expression import AlarmState, Count, ExpectStep
 from level1.frame import BUS_SHIFT, EXTENDED, frame_key, j1939_pgn
 from level1.j1939 import TP_CM
 from level1.passage import FED, NOBODY, Passage, Table, Talkers, clamped
+from level1.plan import Node, Plan
 from level1.supervisor import Supervisor
 
 LEAST_ROWS = 64
@@ -47,47 +46,6 @@ class Group(NamedTuple):
 
     bus: int
     pgn: int
-
-
-class Node:
-    """A page that can be tracked. columns: of its signals; windows: payload bytes they lie in; need: bytes for all of them.
-
-    children: its multiplexer branches; bits, ids: of a branch, its selector and the values of it that it answers to.
-    """
-
-    __slots__ = ("bits", "children", "columns", "ids", "need", "page", "presence", "windows")
-
-    def __init__(self, page: Page):
-        self.page = page
-        self.columns = [SignalColumn(cell) for cell in page.cells]
-        self.presence = Column(page.presence, False)
-        self.windows = tuple(sorted({column.bits.window for column in self.columns}))
-        self.need = max((last_byte(cell.signal) + 1 for cell in page.cells), default=0)
-        self.children = [Node(child) for branches in page.branches.values() for child in branches]
-        self.bits: Bits | None = None
-        self.ids = np.zeros(0, np.uint64)
-        if page.selector is not None:
-            signal, ids = page.selector
-            if signal.is_float:
-                raise Unsupported("a multiplexer is an integer")
-            bottom, top = raw_range(signal)
-            self.bits = Bits(signal)
-            self.ids = np.array(sorted(number - bottom for number in ids if bottom <= number <= top), np.uint64)
-
-    def all(self) -> Iterator[Node]:
-        """Itself and the branches below."""
-        yield self
-        for child in self.children:
-            yield from child.all()
-
-
-class Plan(NamedTuple):
-    """Trees that are tracked, which conditions are answered, which columns they need, and which someone else reads (`live`)."""
-
-    roots: dict[int, Node]
-    answered: tuple[tuple[Watch, ColumnCondition], ...]
-    wanted: frozenset[Column]
-    live: frozenset[Column]
 
 
 def feeds_itself(catalog: Catalog) -> bool:

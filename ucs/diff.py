@@ -17,6 +17,7 @@ from level1.io import config, definitions
 from level1.io.error import OutsideError, did_you_mean
 from ucs import parquet, season
 from ucs.comparison import Comparison, Recorded, Side, rate_rows, span_text
+from ucs.recording import Outcome
 from ucs.render import painted, wants_colour
 from ucs.spans import Behaviour, Change, behaviour, changes, spans
 from ucs.table import aligned
@@ -53,14 +54,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--parquet", metavar="OUT.parquet", help="write the events of each side (old, new, or the value tried) as "
                         "a table for DuckDB, Polars and the like")
     parser.add_argument("--html", metavar="OUT.html", help="write a report with pictures, which opens without a network")
-    add_season_arguments(parser)
-
-
-def add_season_arguments(parser: ArgumentParser) -> None:
-    """How many recordings are worked on at once, and where."""
-    parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one a core)")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="work on a Dask cluster (tcp://host:8786)")
-    parser.add_argument("--fresh", action="store_true", help="do not go on with an interrupted run")
+    season.add_arguments(parser)
 
 
 def run(args: Namespace) -> int:
@@ -92,7 +86,7 @@ def compare(paths: Sequence[str], old: tuple[str, Catalog], new: tuple[str, Cata
     return Comparison(sides[0], sides[1], recorded, found, args.tolerance)
 
 
-def _outcomes(paths: Sequence[str], catalogs: Sequence[Catalog], args: Namespace) -> list[list[season.Outcome]]:
+def _outcomes(paths: Sequence[str], catalogs: Sequence[Catalog], args: Namespace) -> list[list[Outcome]]:
     jobs = [season.Job(path, encoded) for encoded in map(season.encoded, catalogs) for path in paths]
     cache = season.cache_folder()
     with season.progress(len(jobs), sys.stderr) as told:
@@ -103,7 +97,7 @@ def _outcomes(paths: Sequence[str], catalogs: Sequence[Catalog], args: Namespace
     return [done[start:start + len(paths)] for start in range(0, len(done), len(paths))]
 
 
-def _write_table(out: str | None, sides: Sequence[str], outcomes: Sequence[Sequence[season.Outcome]]) -> None:
+def _write_table(out: str | None, sides: Sequence[str], outcomes: Sequence[Sequence[Outcome]]) -> None:
     if out is None:
         return
     with parquet.table(out) as table:
@@ -112,7 +106,7 @@ def _write_table(out: str | None, sides: Sequence[str], outcomes: Sequence[Seque
                 table.add(outcome.path, outcome.decoded(), side)
 
 
-def _recorded(outcomes: Sequence[season.Outcome]) -> list[Recorded]:
+def _recorded(outcomes: Sequence[Outcome]) -> list[Recorded]:
     used = [Recorded(outcome.path, outcome.first_ns / 1e9, outcome.last_ns / 1e9, outcome.hours) for outcome in outcomes
             if not outcome.error]
     if not used:

@@ -6,33 +6,24 @@ import sys
 import time
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TextIO
+from typing import Any, BinaryIO, NamedTuple, TextIO
 
-from level1.catalog import NORMAL, Catalog
-from level1.event import Event, Output, Send, encode, seconds
-from level1.frame import Frame
-from level1.freeze_frame import STATE_WORDS
+from level1.catalog import Catalog
+from level1.event import Event, encode, seconds
 from level1.io import config, definitions
 from level1.io.error import OutsideError
 from level1.io.merged import MergedLog
 from level1.io.replay import Log
-from level1.supervisor import Supervisor
 from ucs import onto, parquet, plot, season
-from ucs.diff import add_season_arguments
+from ucs.recording import Outcome, Replay, Through
 from ucs.remarks import remarks
 from ucs.render import WORDS, event_line, painted, since, wants_colour
 from ucs.trace import Trace
 
-if TYPE_CHECKING:
-    from level1.sieve import Sieve
-
-UNIT, BOOT = "replay", 1
-"""Identity of a replay's events; every recording is a run of its own, so that it gives the same bytes beside others."""
 PROGRESS_S = 0.2
-Through = Callable[[Iterator[list[Frame]]], Iterator[list[Frame]]]
 POOL_BYTES = 8 << 20
 """Recordings smaller than this together are not worth other processes (each takes about a second to start)."""
 
@@ -62,7 +53,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--bitrate", type=int, metavar="N", help="onto a bus: bit/s, for interfaces that need it")
     parser.add_argument("--scalar", action="store_true", help="read and evaluate frame by frame; slower, with the same events")
     parser.add_argument("--merge", action="store_true", help="the recordings are of one drive: one run, in the order of time")
-    add_season_arguments(parser)
+    season.add_arguments(parser)
 
 
 def run(args: Namespace) -> int:
@@ -116,70 +107,6 @@ class _Task(NamedTuple):
         return season.Job(path, catalog, self.armed, self.buses, self.asked, self.blocks)
 
 
-class Replay:
-    """A recording run through a supervisor of its own.
-
-    through: what takes the batches of frames on their way and hands them on (plays, draws), None for nothing.
-    blocks: frames in columns (`level1.sieve`) or one by one, which gives the same events; None: whatever is sooner done.
-    counts: (alarm, event) -> how often. sends: frames that repairs would have sent. keys: of all frames seen.
-    """
-
-    def __init__(self, log: Log | MergedLog, catalog: Catalog, armed: Collection[str] | None, through: Through | None = None,
-                 blocks: bool | None = None):
-        self.log = log
-        self.through = through
-        self.supervisor = Supervisor(catalog, unit=UNIT, boot=BOOT, armed=armed, broadcast=False)
-        self._sieve: Sieve | None = None
-        if through is None and (log.is_long if blocks is None else blocks):
-            from level1.sieve import Sieve  # numpy takes a tenth of a second to import
-            self._sieve = Sieve(self.supervisor)
-        self.counts: Counter[tuple[str, str]] = Counter()
-        self.sends = 0
-        self.keys: set[int] = set()
-
-    def batches(self) -> Iterator[list[Event]]:
-        """The events, a list for each batch of frames; ends with the deadlines up to the last time stamp."""
-        for outputs in self._in_blocks(self._sieve) if self._sieve else self._one_by_one():
-            yield self._events(outputs)
-        yield self._events(self.supervisor.tick(self.log.last_ns))
-
-    def _one_by_one(self) -> Iterator[Sequence[Output]]:
-        batches = self.log.batches()
-        for batch in self.through(batches) if self.through else batches:
-            self._begin()
-            self.keys.update([frame.key for frame in batch])
-            yield self.supervisor.receive_many(batch)
-
-    def _in_blocks(self, sieve: Sieve) -> Iterator[Sequence[Output]]:
-        for block in self.log.blocks():
-            self._begin()
-            self.keys.update(block.keys)
-            yield sieve.receive(block)
-
-    def _begin(self) -> None:
-        """The first time stamp has been read: is it of the wall clock?"""
-        if self.log.is_utc:
-            self.supervisor.utc_offset_ns = 0
-
-    def outcome(self, asked: Iterable[str], events: tuple[bytes, ...] = ()) -> season.Outcome:
-        """What came of it, once all batches were taken. asked: channels that the user named."""
-        log, supervisor = self.log, self.supervisor
-        standing = {name: STATE_WORDS[state] for name, state in supervisor.alarm_states().items() if state != NORMAL}
-        told = tuple(remarks(log, supervisor.counters, self.keys, supervisor.catalog, asked))
-        return season.Outcome(str(log.path), events, log.frames_read, log.first_ns, log.last_ns, log.skipped, standing, self.sends,
-                              told)
-
-    def _events(self, outputs: Iterable[Any]) -> list[Event]:
-        events = []
-        for output in outputs:
-            if isinstance(output, Event):
-                self.counts[output.alarm, output.event] += 1
-                events.append(output)
-            else:
-                self.sends += isinstance(output, Send)
-        return events
-
-
 class _Out:
     """Where the results go: JSON lines, Parquet, and text for people."""
 
@@ -202,7 +129,7 @@ class _Out:
             self._table.add(path, [event])
         print(event_line(event, since(event.t, seconds(first_ns)), self.colour), file=self.text)
 
-    def end(self, outcome: season.Outcome, counts: Counter[tuple[str, str]], took_s: float | None = None) -> None:
+    def end(self, outcome: Outcome, counts: Counter[tuple[str, str]], took_s: float | None = None) -> None:
         """The summary of a recording, and what was odd."""
         print(*_summary(outcome, counts, took_s), sep="\n", file=self.text, flush=True)
         for line in outcome.remarks:
@@ -213,7 +140,7 @@ class _Out:
         self.failed += 1
         print(f"ucs: {text}", file=sys.stderr)
 
-    def outcome(self, outcome: season.Outcome) -> None:
+    def outcome(self, outcome: Outcome) -> None:
         """A recording that another process has done."""
         if outcome.error:
             self.error(outcome.error)
@@ -298,11 +225,11 @@ def _run_season(paths: Sequence[str], task: _Task, args: Namespace, out: _Out) -
     """Many recordings, in several processes or on a cluster; the results in the order of the arguments."""
     catalog = season.encoded(task.catalog)
     jobs = [task.job(path, catalog) for path in paths]
-    started, waiting, done = time.perf_counter(), iter(paths), dict[str, season.Outcome]()
+    started, waiting, done = time.perf_counter(), iter(paths), dict[str, Outcome]()
     told, frames, following = 0, 0, next(waiting, None)
     try:
         with season.progress(len(jobs), sys.stderr) as show:
-            def take(outcome: season.Outcome) -> None:
+            def take(outcome: Outcome) -> None:
                 nonlocal told, frames, following
                 told, frames = told + 1, frames + outcome.frames
                 done[outcome.path] = outcome
@@ -352,7 +279,7 @@ class _Progress:
             self._shown = False
 
 
-def _summary(outcome: season.Outcome, counts: Counter[tuple[str, str]], took_s: float | None) -> Iterator[str]:
+def _summary(outcome: Outcome, counts: Counter[tuple[str, str]], took_s: float | None) -> Iterator[str]:
     """What was read, how fast, and each alarm's count."""
     duration_s = (outcome.last_ns - outcome.first_ns) / 1e9
     speed = "" if took_s is None else f" in {took_s:.3f} s ({outcome.frames / took_s:,.0f} frames/s)"

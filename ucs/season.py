@@ -11,6 +11,7 @@ import hashlib
 import importlib
 import os
 import signal
+from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -24,9 +25,10 @@ from typing import Any, TextIO
 import msgspec
 
 from level1.catalog import Catalog
-from level1.event import Event, decode, encode
+from level1.event import encode
 from level1.io.error import OutsideError
 from level1.io.replay import Log
+from ucs.recording import Outcome, Replay
 
 SUFFIXES = (".log", ".candump", ".txt", ".nmea", ".asc", ".blf", ".trc", ".csv", ".mf4", ".pcap", ".pcapng")
 """What counts as a recording in a folder, each also with `.gz`."""
@@ -34,7 +36,7 @@ SUFFIXES = (".log", ".candump", ".txt", ".nmea", ".asc", ".blf", ".trc", ".csv",
 
 class Job(msgspec.Struct, frozen=True):
     """A recording and what to run over it. catalog: a `Catalog` as msgpack; armed: alarms whose repairs act, None for all.
-    asked: channels that the user named. blocks: as in `replay.Replay`."""
+    asked: channels that the user named. blocks: as in `recording.Replay`."""
 
     path: str
     catalog: bytes
@@ -51,34 +53,16 @@ class Job(msgspec.Struct, frozen=True):
         return hashlib.sha256(repr(parts).encode() + self.catalog).hexdigest()[:32]
 
 
-class Outcome(msgspec.Struct, frozen=True):
-    """What came of a job. events: JSON lines. standing: state of each alarm that is not normal at the end. sends: frames that
-    repairs would have sent. remarks: what was odd. error: why the recording could not be used, else empty."""
-
-    path: str
-    events: tuple[bytes, ...] = ()
-    frames: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-    skipped: int = 0
-    standing: dict[str, str] = {}
-    sends: int = 0
-    remarks: tuple[str, ...] = ()
-    error: str = ""
-
-    def decoded(self) -> list[Event]:
-        """The events."""
-        return [decode(line) for line in self.events]
-
-    @property
-    def hours(self) -> float:
-        """Length of the recording."""
-        return (self.last_ns - self.first_ns) / 3.6e12
-
-
 def encoded(catalog: Catalog) -> bytes:
     """A catalog as jobs carry it."""
     return msgspec.msgpack.encode(catalog)
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """How many recordings are worked on at once, and where."""
+    parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one a core)")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="work on a Dask cluster (tcp://host:8786)")
+    parser.add_argument("--fresh", action="store_true", help="do not go on with an interrupted run")
 
 
 def recordings(names: Sequence[str]) -> list[str]:
@@ -108,7 +92,6 @@ def _is_recording(path: Path) -> bool:
 
 def work(job: Job) -> Outcome:
     """Run one job, in whatever process."""
-    from ucs.replay import Replay
     try:
         log = Log(job.path, job.buses, one_bus=not job.buses)
         replay = Replay(log, msgspec.msgpack.decode(job.catalog, type=Catalog), job.armed, blocks=job.blocks)

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge import wire
+from bridge.contract import schemas
 from level1.event import EVENTS, PRIORITIES, Event, Monitor, SentFrame, encode, seconds
 
 FOLDER = Path(wire.__file__).parent / "schema"
@@ -58,13 +59,13 @@ def test_a_monitoring_sample_becomes_its_message() -> None:
     assert (message.seq, message.message, message.values) == (8, "motion", {"v": 3.0})
 
 
-@pytest.mark.parametrize("name", wire.schemas())
+@pytest.mark.parametrize("name", schemas())
 def test_the_published_schema_is_the_generated_one(name: str) -> None:
-    assert (FOLDER / name).read_text(encoding="utf-8") == wire.schemas()[name], "run `python -m bridge.wire` and commit"
+    assert (FOLDER / name).read_text(encoding="utf-8") == schemas()[name], "run `python -m bridge.contract` and commit"
 
 
 def test_no_other_schema_is_published() -> None:
-    assert {path.name for path in FOLDER.iterdir()} == set(wire.schemas())
+    assert {path.name for path in FOLDER.iterdir()} == set(schemas())
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)

@@ -12,6 +12,7 @@ import pytest
 from level1.io.definitions import load
 from level1.io.error import OutsideError
 from ucs import main, season
+from ucs.recording import Outcome
 from ucs.spans import Span, behaviour, bursts, busiest, changes, floods
 
 TEXT = """VERSION ""
@@ -120,7 +121,7 @@ def test_an_interrupted_run_goes_on_where_it_was(folder: Path, monkeypatch: pyte
     jobs = [season.Job(path, catalog) for path in season.recordings([str(folder / "season")])]
     cache = folder / "cache"
 
-    def stop(outcome: season.Outcome) -> None:
+    def stop(outcome: Outcome) -> None:
         raise KeyboardInterrupt
     with pytest.raises(KeyboardInterrupt):
         season.run(jobs, workers=1, cache=cache, told=stop)
@@ -128,7 +129,7 @@ def test_an_interrupted_run_goes_on_where_it_was(folder: Path, monkeypatch: pyte
     worked: list[str] = []
     real = season.work
 
-    def watched(job: season.Job) -> season.Outcome:
+    def watched(job: season.Job) -> Outcome:
         worked.append(job.path)
         return real(job)
     monkeypatch.setattr(season, "work", watched)
@@ -194,5 +195,5 @@ def test_chatter_and_floods_by_the_standards_figures() -> None:
 
 
 def test_outcomes_travel_as_bytes() -> None:
-    outcome = season.Outcome("x", (b"{}",), 3, 1, 2)
-    assert msgspec.msgpack.decode(msgspec.msgpack.encode(outcome), type=season.Outcome) == outcome
+    outcome = Outcome("x", (b"{}",), 3, 1, 2)
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(outcome), type=Outcome) == outcome

@@ -19,6 +19,7 @@ from level1.event import decode
 from level1.io.merged import MergedLog
 from level1.io.replay import LogError
 from ucs import main, season
+from ucs.recording import Outcome
 
 START_S = 1_700_000_000
 TEXT = """VERSION ""
@@ -131,7 +132,7 @@ def test_ctrl_c_ends_with_a_word_and_the_next_run_goes_on_from_there(replay: Run
     worked: list[str] = []
     real = season.work
 
-    def interrupted(job: season.Job) -> season.Outcome:
+    def interrupted(job: season.Job) -> Outcome:
         worked.append(Path(job.path).name)
         if len(worked) == 3:
             raise KeyboardInterrupt
