@@ -45,6 +45,11 @@ class Actuator(Generic[Position]):
             self.position = target
             self._arrives_ns = None
 
+    @property
+    def target(self) -> Position:
+        """Where it was told to go last."""
+        return self._target
+
     def again(self, now_ns: int) -> None:
         """One more try, if it stands elsewhere, does not move, and was not tried at this very moment."""
         if self._target != self.position and self._arrives_ns is None and self._tried_ns != now_ns:

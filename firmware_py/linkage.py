@@ -79,6 +79,12 @@ class Pto:
         self.clutch: Actuator[str] = Actuator("Off", CLUTCH_NS, retry_ns=None)
         self.rpm = 0.0
 
+    def mend(self, now_ns: int) -> None:
+        """Its clutch works again. A spring opens it, so that it lets go now if it is off; to engage, it must be energised anew."""
+        self.clutch.release()
+        if self.clutch.target == "Off":
+            self.clutch.again(now_ns)
+
     @property
     def state(self) -> str:
         """Off, RunningUp, On or RunningDown."""

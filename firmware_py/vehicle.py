@@ -464,7 +464,7 @@ class Vehicle(Node):
                 self.hitch.release() if action == WORKS else self.hitch.jam(statement.commands)
             case "pto", action:
                 refused = {"refuses": ("On",), "stays on": ("Off",)}.get(action)
-                self.pto.clutch.release() if refused is None else self.pto.clutch.jam(refused, statement.commands)
+                self.pto.mend(now_ns) if refused is None else self.pto.clutch.jam(refused, statement.commands)
             case "implement", "slow":
                 self.implement.response_ns = SLOW * IMPLEMENT_NS
             case "implement", action:

@@ -110,8 +110,7 @@ class Day:
         scenario = Scenario("", 0, plan.length_ns, plan.nodes, ())
         self._nodes = build(scenario, seed=Random(plan.seed).getrandbits(48), codec=codec).nodes
         self._world = World(self._nodes, codec)
-        self._people = People(plan.machine, self._world, Random(f"{plan.seed}/people"), self._carry_out,
-                              lambda: self._episodes.locked)
+        self._people = People(plan.machine, self._world, Random(f"{plan.seed}/people"), self._carry_out)
         self._unit = SimulatedUnit(Supervisor(catalog, unit="season", start_ns=0), self._deliver)
         self._episodes = Episodes(catalog)
         self._catalog = catalog

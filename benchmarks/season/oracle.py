@@ -97,6 +97,8 @@ FLAMER_MISCOUNTS = _symptom("FlamerFrozen", 2.0, lambda w, n: w.flamer.talks)
 FLAMER_STANDS = _symptom("FlamerFrozen", 2.0, lambda w, n: w.flamer.sends and not w.flamer.talks)
 
 OUT = ("PilotFlameOut", "PilotFlameTooOften")
+NOT_CONFIRMED = ("FlamingStartStopFailure", "ChangeBurnersFailure")
+"""A program that stands does not say that it did what it was told meanwhile: whoever orders flaming off never sees it off."""
 GAS_TAIL_S = 60.0
 """A repair purges for 30 s before it tries; what it finds then is a consequence, too."""
 
@@ -121,7 +123,7 @@ FLAMER: Mapping[str, Row] = {
     "flame_sensor stuck on": Row((FALSE_FLAME,), ("FlamingStartStopFailure", *OUT), GAS_TAIL_S),
     "flame_sensor stuck off": Row((FLAME_OUT, UNLIT), OUT, GAS_TAIL_S),
     "silent": Row((FLAMER_QUIET,), OUT),
-    "frozen": Row((FLAMER_STANDS,), ("FlamerCommandsLost", "PilotIgnitionFailure", *OUT), GAS_TAIL_S),
+    "frozen": Row((FLAMER_STANDS,), ("FlamerCommandsLost", "PilotIgnitionFailure", *OUT, *NOT_CONFIRMED), GAS_TAIL_S),
     "reset": Row((FLAMER_QUIET,), ("FlamerCommandsLost", *OUT), GAS_TAIL_S),
 }
 FLAMER_MISSION: Mapping[str, Row] = {

@@ -1,7 +1,7 @@
 """The people of a day: who orders the work, resets what is locked out, fills tanks and presses the start button."""
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from random import Random
 
 from benchmarks.season.world import World
@@ -14,14 +14,12 @@ Tell = Callable[[str, str, str, int | None], None]
 
 
 class People:
-    """tell(…) carries out what they want. Each has moods of its own: `dice`. locked(): alarms that are locked out."""
+    """tell(…) carries out what they want. Each has moods of its own: `dice`."""
 
-    def __init__(self, machine: str, world: World, dice: Random, tell: Tell, locked: Callable[[], Collection[str]]):
+    def __init__(self, machine: str, world: World, dice: Random, tell: Tell):
         self._world = world
         self._dice = dice
         self._tell = tell
-        self._locked = locked
-        self._stalled = False
         parts = {"flaming tool": (self._flame,), "sprayer boom": (self._spray,), "tractor": (self._drive,),
                  "tractor with boom": (self._drive, self._spray), "air-blast sprayer": (self._blow,)}
         self._parts: tuple[Callable[[], None], ...] = parts[machine]
@@ -76,11 +74,6 @@ class People:
 
     def _drive(self) -> None:
         tractor = self._world.tractor
-        if self._stalled:
-            self._tell("tractor", "engine", "works", None)
-        self._stalled = not self._stalled and "PtoNotUnset" in self._locked()
-        if self._stalled:  # a shaft that is locked out and still turns: what the clutch doesn't do, the engine must
-            self._tell("tractor", "engine", "dies", None)
         match tractor.controller:
             case "Stopped":
                 self._tell("tractor", "start_button", "pressed", None)

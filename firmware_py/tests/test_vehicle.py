@@ -390,6 +390,23 @@ def test_a_pto_that_stays_on_runs_on() -> None:
     assert pto.state == "On"
 
 
+@pytest.mark.parametrize(("wanted", "fault", "after"), [("Off", "Off", "Off"), ("On", "On", "Off")])
+def test_a_mended_clutch_lets_go_by_itself_and_engages_only_when_told_again(wanted: str, fault: str, after: str) -> None:
+    pto = Pto()
+    ticks = iter(range(0, 10**12, 50_000_000))
+
+    def run(wanted: str) -> str:
+        for _ in range(200):
+            pto.advance(next(ticks), wanted, 1800, 0.05)
+        return pto.state
+
+    run("Off" if wanted == "On" else "On")
+    pto.clutch.jam((fault,))
+    assert run(wanted) != wanted
+    pto.mend(next(ticks))
+    assert run(wanted) == after
+
+
 # --- the engine ---------------------------------------------------------------------------------------------------------------
 
 

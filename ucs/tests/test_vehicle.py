@@ -349,6 +349,18 @@ def test_a_lock_out_pauses_the_mission_and_can_be_reset(catalog: Catalog) -> Non
     assert locked.tractor.pto.state == "On"
 
 
+@pytest.mark.covers("PtoNotUnset", "locked_out", "cleared")
+def test_a_shaft_that_did_not_stop_is_held_off_until_it_does_and_then_can_be_reset(catalog: Catalog) -> None:
+    turns = farm(catalog, "at 10 s: tractor.pto stays on for 70 s", orders=(*WORK, "at 20 s: pto off", "at 100 s: mission resume"),
+                 duration="2 min").run(70)
+    assert turns.life("PtoNotUnset")[-1] == "locked_out"
+    assert "PtoNotUnset" in turns.order("reset", "PtoNotUnset", origin="local"), "refused while the shaft turns"
+    assert turns.run(90).tractor.pto.state == "Off"
+    assert turns.life("PtoNotUnset")[-1] == "locked_out", "held until somebody says so"
+    assert turns.order("reset", "PtoNotUnset", origin="local") == ""
+    assert turns.run().life("PtoNotUnset")[-1] == "cleared"
+
+
 # --- orders from above --------------------------------------------------------------------------------------------------------
 
 
