@@ -158,6 +158,9 @@ class NoJournal:
         """Nothing is kept."""
         return True
 
+    def record(self, monitors: object) -> None:
+        """Nothing is kept."""
+
 
 def core(sock: socket.socket, folder: Path, tally: Tally, journaled: bool) -> Contender:
     """The live loop as `ucs run` puts it together. journaled: every event is on the disk before the next frame is looked at."""

@@ -1,8 +1,8 @@
 """CANopen devices as level 1 sees them (CiA 301): heartbeat, node guarding, boot-up, NMT commands, emergencies, error history.
 
-Pure: time comes with frames and deadlines. It commands nobody; the only thing it sends is the question of node guarding. What it
-finds becomes causes of two alarms of `ucs.dbc`: each emergency one of `DeviceEmergency`, each device that is not heard any more
-one of `DeviceSilent`.
+Pure: time comes with frames and deadlines. It commands nobody; the only things it sends are questions: node guarding, and the
+error history. What it finds becomes causes of two alarms of `ucs.dbc`: each emergency one of `DeviceEmergency`, each device that is
+not heard any more one of `DeviceSilent`.
 
 Theory of operation. A device is known from the configuration, or from its first boot-up or heartbeat: an implement may be coupled
 while the program runs. From then on its heartbeat must come:
@@ -20,7 +20,9 @@ while the program runs. From then on its heartbeat must come:
 - An emergency stays until the device says that it is over (error code 0x00xx) or has booted: both forget all its errors. When the
   error register that comes with 0x00xx still has bits set, only the errors are over whose own bit is not among them.
 - A silent device that was taken off on purpose is forgotten when someone at the machine says so (reset of `DeviceSilent`).
-- Answers to others who read the error history (object 0x1003 by SDO) are taken along with the emergencies.
+- Answers to whoever reads the error history (object 0x1003 by SDO) are taken along with the emergencies. Of a device for which the
+  configuration wants it, the UCS reads it itself: `level1.io.canopen` asks, and what it asks leaves through the gate like all else,
+  which lets requests to read pass and nothing that writes.
 
 The identifiers of heartbeats and emergencies mean that only on a CANopen bus. A bus is one when it has a configured device, or
 when a well-formed heartbeat was heard on it; an identifier that a DBC file gives to another message is never taken for one.
@@ -40,7 +42,7 @@ from level1.frame import BUS_SHIFT, REMOTE, frame_key
 from level1.timer import FAR, Timers
 
 DEVICE_EMERGENCY, DEVICE_SILENT = "DeviceEmergency", "DeviceSilent"
-NMT, EMERGENCY, SDO_ANSWER, HEARTBEAT = 0x000, 0x080, 0x580, 0x700
+NMT, EMERGENCY, SDO_ANSWER, SDO_REQUEST, HEARTBEAT = 0x000, 0x080, 0x580, 0x600, 0x700
 """Identifiers of the predefined connection set; all but NMT's plus the node id."""
 NODES = range(1, 128)
 MARGIN = Fraction(7, 2)
@@ -66,6 +68,13 @@ MAX_ERRORS = 16
 MAX_HISTORY = 8
 """Entries of the error history that events carry."""
 HISTORY = 0x1003
+SDO = "SDO request"
+"""What requests to read are called among the frames sent."""
+REQUEST_NS = 200_000_000
+"""A request to read is worth sending for so long: who asks waits 0.3 s for the answer."""
+INITIATE_UPLOAD, UPLOAD_SEGMENT, ABORT = 0x40, (0x60, 0x70), 0x80
+"""First bytes of the only SDO requests that the UCS may send (CiA 301 §7.2.4.3): read an object, read on, give up reading. A write
+begins with 0x20 to 0x2F (initiate download), goes on with 0x00 to 0x1F (its segments) or is one of blocks (0xC0 to 0xDF)."""
 
 STATES = {0: "booting", 4: "stopped", 5: "operational", 127: "pre-operational"}
 """NMT states, as heartbeats say them."""
@@ -97,7 +106,8 @@ class Device(msgspec.Struct, frozen=True):
 
     bus: its index. node: 1 to 127. heartbeat_ns: its heartbeat time, None: learned; 0: it has none and is not missed.
     required: it is missed also when it was never heard; else only from its first sign of life on. errors: texts by error code.
-    guard_ns: it is guarded, and asked so often; life_factor: times that without a right answer make it silent.
+    guard_ns: it is guarded, and asked so often; life_factor: times that without a right answer make it silent. history: its last
+    errors may be read by SDO.
     """
 
     bus: int
@@ -108,6 +118,7 @@ class Device(msgspec.Struct, frozen=True):
     errors: dict[int, str] = {}
     guard_ns: int | None = None
     life_factor: int = LIFE_FACTOR
+    history: bool = False
 
 
 class Host(Protocol):
@@ -291,6 +302,11 @@ class Devices:
         """Keys of the remote frames that it may send."""
         return frozenset(self._guards)
 
+    @property
+    def readable(self) -> frozenset[int]:
+        """Keys of the SDO requests by which error histories may be read."""
+        return frozenset(sdo_key(bus, node) for (bus, node), device in self._known.items() if self.asks and device.history)
+
     def listeners(self) -> dict[int, Listener]:
         """Who wants to hear which 11-bit identifier."""
         wanted: dict[int, Listener] = {NMT: self.command}
@@ -450,6 +466,20 @@ class Devices:
 def guard_key(bus: int, node: int) -> int:
     """The key of the remote frame by which a device is guarded."""
     return frame_key(HEARTBEAT + node, False, bus) | REMOTE
+
+
+def sdo_key(bus: int, node: int) -> int:
+    """The key of the SDO requests to a device."""
+    return frame_key(SDO_REQUEST + node, False, bus)
+
+
+def is_reading(request: bytes) -> bool:
+    """Whether an SDO request reads the error history, or goes on or ends with that: it changes nothing in the device."""
+    if len(request) != 8:
+        return False
+    if request[0] == INITIATE_UPLOAD:
+        return request[1] | request[2] << 8 == HISTORY
+    return request[0] in UPLOAD_SEGMENT or request[0] == ABORT
 
 
 def _history(node: _Node) -> dict[str, Any]:

@@ -125,6 +125,7 @@ _SPELT_OUT = Decimal("1e-6")
 _encoder = msgspec.json.Encoder(decimal_format="number")
 _decoder = msgspec.json.Decoder(Event, strict=False)
 _decode_commanded = msgspec.json.Decoder(Commanded, strict=False).decode
+_decode_monitor = msgspec.json.Decoder(Monitor, strict=False).decode
 
 
 def encode(event: Event | Commanded | Monitor | Result) -> bytes:
@@ -143,3 +144,8 @@ def decode(line: bytes | str) -> Event:
 def decode_commanded(line: bytes | str) -> Commanded:
     """The command of one JSON line. Raises as `decode`."""
     return _decode_commanded(line)
+
+
+def decode_monitor(line: bytes | str) -> Monitor:
+    """The monitoring message of one JSON line. Raises as `decode`."""
+    return _decode_monitor(line)

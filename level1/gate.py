@@ -2,8 +2,8 @@
 
 Only messages whose sender is `UCS` and which a repair, a command or an alarm uses, or which are readings of the UCS itself;
 only values within the bits and the limits of the DBC; no more frames than a burst allows. What passes gets an expiry, so that
-nothing stale is sent late. Of protocols, only what makes the UCS a node of J1939 where it has an address, and the questions of
-node guarding.
+nothing stale is sent late. Of protocols, only what makes the UCS a node of J1939 where it has an address, the questions of node
+guarding, and SDO requests that read the error history of a device for which the configuration says so; none that writes.
 """
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Collection, Iterable
 from fractions import Fraction
 
+from level1.canopen import is_reading
 from level1.catalog import Catalog, Message, Signal
 from level1.decode import RawValue, Scale, raw_range, reader, reserved
 from level1.event import Send
@@ -34,16 +35,17 @@ class Refused(Exception):
 
 class Gate:
     """The allow-list and the limits. readings: allowed too, and to say *not available* and *error*, which no command may.
-    j1939: buses on which the UCS is a node. questions: keys of remote frames that may be sent."""
+    j1939: buses on which the UCS is a node. questions: keys of remote frames that may be sent. readable: keys of SDO requests to
+    devices whose error history may be read."""
 
     def __init__(self, catalog: Catalog, allowed: Iterable[str], readings: frozenset[str] = frozenset(),
-                 j1939: Collection[int] = (), questions: Collection[int] = ()):
+                 j1939: Collection[int] = (), questions: Collection[int] = (), readable: Collection[int] = ()):
         self.catalog = catalog
         self.readings = readings
         self.allowed = frozenset(name for name in {*allowed, *readings} if catalog.messages[name].sent_by_ucs)
         self.recent: dict[str | int, list[int]] = {}
         self._limits = {name: _limits(catalog.messages[name], name in readings) for name in self.allowed}
-        self._j1939, self._questions = frozenset(j1939), frozenset(questions)
+        self._j1939, self._questions, self._readable = frozenset(j1939), frozenset(questions), frozenset(readable)
 
     def check(self, t_ns: int, name: str, data: bytes) -> int:
         """Let a payload pass and give the time (ns) until which it may be sent. Raises Refused."""
@@ -63,10 +65,16 @@ class Gate:
     def check_protocol(self, send: Send) -> None:
         """Let a frame of a protocol pass. Raises Refused."""
         key = send.key
-        node = bool(key & EXTENDED) and key >> BUS_SHIFT in self._j1939 and j1939_pgn(key & 0x1FFF_FFFF) in SENT_GROUPS
-        if key not in self._questions if key & REMOTE else not node:
+        if not self._is_of_protocol(key, send.data):
             raise Refused(f"{send.message}: {key & 0x1FFF_FFFF:X} is not on the list of what the UCS may send")
         self._count(send.t_ns, key, send.message)
+
+    def _is_of_protocol(self, key: int, data: bytes) -> bool:
+        if key & REMOTE:
+            return key in self._questions
+        if key & EXTENDED:
+            return key >> BUS_SHIFT in self._j1939 and j1939_pgn(key & 0x1FFF_FFFF) in SENT_GROUPS
+        return key in self._readable and is_reading(data)
 
     def _count(self, t_ns: int, key: str | int, name: str) -> None:
         """Raises Refused when there were too many of these."""

@@ -16,7 +16,7 @@ from typing import Any
 from level1.alarm import AlarmMachine
 from level1.board import ALWAYS, Board, Cell, Page, Watch
 from level1.can_gnss import CanReceiver
-from level1.canopen import DEVICE_EMERGENCY, DEVICE_SILENT, NMT, Device, Devices
+from level1.canopen import DEVICE_EMERGENCY, DEVICE_SILENT, NMT, REQUEST_NS, SDO, Device, Devices
 from level1.catalog import ACTIVE, LOCKED_OUT, NORMAL, REPAIRING, Catalog, Command, Message, Repair
 from level1.command import Order
 from level1.condition import Compiler, Things, Thresholds, Verdict, Zone, walk
@@ -103,7 +103,7 @@ class Supervisor:
         self._broadcasts = self._make_broadcasts() if broadcast else {}
         self._samplers = self._make_samplers(monitor_ns) if monitor_ns else []
         self.gate = Gate(catalog, self.sendable(), frozenset(readings), j1939 or (),
-                         self._devices.questions if self._devices is not None else ())
+                         *(self._devices.questions, self._devices.readable) if self._devices is not None else ())
         self.subsystems.own_keys = frozenset(
             frame_key(message.can_id, message.extended, bus) for name in self._broadcasts
             for message in (catalog.messages[name],) if message.senders == ("UCS",) for bus in catalog.buses.get(name, (0,)))
@@ -185,6 +185,12 @@ class Supervisor:
             if name in self.board.pages:
                 self.board.pages[name].receive(self.now_ns, payload)
         self.board.settle(self.now_ns)
+        return self._take()
+
+    def ask(self, bus: int, can_id: int, data: bytes, now_ns: int) -> Sequence[Output]:
+        """Send a request by which a device's error history is read (`io.canopen`), if the gate lets it pass; 11-bit identifier."""
+        self._advance(now_ns)
+        self.hand_out(Send(self.now_ns, frame_key(can_id, False, bus), data, SDO, "error history", self.now_ns + REQUEST_NS))
         return self._take()
 
     def next_deadline(self) -> int | None:
@@ -499,7 +505,7 @@ class Supervisor:
 
     def forbidden(self, repair: Repair) -> str:
         """Nothing moves while the unit is stopped or paused from above."""
-        return f"the unit is {self.mode} from above" if repair.moves and self.mode != "running" else ""
+        return f"the unit is {self.mode}" if repair.moves and self.mode != "running" else ""
 
     # --- sending ----------------------------------------------------------------------------------------------------------
 

@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from level1.event import EVENTS, Commanded, Event, encode
+from level1.event import EVENTS, Commanded, Event, Monitor, encode
 from level1.io.config import ConfigError, duration_ns, load
 from level1.io.error import OutsideError
 from level1.io.journal import FIRST, JournalError, Position, Reader
+from ucs import history
 
 POLL_S = 0.1
 CHUNK = 1000
@@ -30,7 +31,8 @@ Writer = Callable[[Entry], None]
 _encoder = msgspec.json.Encoder(decimal_format="number")
 DESCRIPTION = """\
 Lists what is in a unit's journal, oldest first: of events time, boot.seq, alarm, event, text; among them the commands that reached
-supervision, and what came of each. Reads only; `ucs run` may be running.
+supervision, and what came of each. Reads only; `ucs run` may be running. With --monitor the monitoring history instead, as it was
+written: a minute at a time.
 """
 EPILOG = """\
 Times are UTC labels (2025-05-01, 2025-05-01T10:30, …10:30:05Z), or "15 min" and the like before now.
@@ -38,6 +40,7 @@ Times are UTC labels (2025-05-01, 2025-05-01T10:30, …10:30:05Z), or "15 min" a
   ucs journal unit.toml --since "2 h" --alarm PilotFlameOut --values
   ucs journal unit.toml --event command --values
   ucs journal unit.toml --follow
+  ucs journal unit.toml --monitor motion --since "10 min"
   ucs journal /media/card/journal.db --format csv > events.csv
 """
 
@@ -54,6 +57,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--boot", metavar="N", type=int, help="only this boot of the unit")
     parser.add_argument("--last", metavar="N", type=int, help="only the last N of them")
     parser.add_argument("--values", action="store_true", help="show the freeze frame and the frames sent")
+    parser.add_argument("--monitor", metavar="MESSAGE", nargs="?", const="",
+                        help="the monitoring history instead, of all monitoring messages or of one")
     parser.add_argument("--follow", action="store_true", help="go on with new events as they come")
     parser.add_argument("--format", choices=("text", "jsonl", "csv"), default="text", help="jsonl and csv for other programs")
 
@@ -65,6 +70,8 @@ def run(args: argparse.Namespace) -> int:
     query = Query(args.alarm, args.event, _moment("--since", args.since), _moment("--until", args.until), args.boot)
     write = {"text": _text_writer(args.values), "jsonl": _write_json, "csv": _csv_writer()}[args.format]
     path = _journal_path(args.unit)
+    if args.monitor is not None:
+        return history.show(path, _of_monitoring(args), query, args.last, args.format, args.values)
     if args.follow and not _await(path):
         return 0
     with Reader(path) as reader:
@@ -90,7 +97,7 @@ class Query(NamedTuple):
     until: datetime | None = None
     boot: int | None = None
 
-    def in_time(self, entry: Entry) -> bool:
+    def in_time(self, entry: Entry | Monitor) -> bool:
         """Whether it is within the times asked for; what has no UTC is not, when any is."""
         if self.since is None and self.until is None:
             return True
@@ -179,6 +186,16 @@ def _journal_path(path: Path) -> Path:
     if config.journal is None:
         raise ConfigError(f'{path}: journal: missing; write [journal] path = "/var/lib/ucs/journal.db"')
     return Path(config.journal.path)
+
+
+def _of_monitoring(args: argparse.Namespace) -> str:
+    """The message that --monitor names. Raises OutsideError for options that don't go with it."""
+    if args.follow:
+        raise OutsideError("--monitor --follow: the history is written a minute at a time; `ucs monitor unit.toml` shows it live")
+    for option in ("alarm", "event"):
+        if getattr(args, option) is not None:
+            raise OutsideError(f"--monitor --{option}: leave one of the two out; monitoring messages are no events")
+    return str(args.monitor)
 
 
 def _moment(option: str, text: str | None) -> datetime | None:

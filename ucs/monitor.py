@@ -349,7 +349,7 @@ class Monitor:
     def _source(self, run: RunStanding | None) -> str:
         if run is not None:
             hangs = f"; HANGS for {roughly(run.turn_age_s)}" if run.turn_age_s > 3 else ""
-            mode = "" if run.mode == "running" else f", {run.mode} from above"
+            mode = "" if run.mode == "running" else f", {run.mode}"
             armed = ", ".join(run.armed) or "none"
             return f"supervised for {roughly(run.uptime_s)}, boot {run.boot}{mode}; armed: {armed}{hangs}"
         if self._unit is not None:

@@ -22,7 +22,7 @@ from level1.io.config import Config
 from level1.io.error import OutsideError
 from level1.io.inbox import Inbox
 from level1.io.journal import FIRST, Journal, Reader
-from level1.io.live import Live, decode_state
+from level1.io.live import Live, decode_state, encode_state
 from level1.io.systemd import Supervised
 from level1.memory import AlarmMemory, State
 from level1.supervisor import Supervisor
@@ -32,6 +32,8 @@ from ucs.printer import Printer
 from ucs.render import clock, event_line, painted, wants_colour
 from ucs.uplink import Uplink
 
+MONITOR_NS = 250_000_000
+"""Period of the monitoring messages where no bridge says otherwise."""
 PLAUSIBLE_S = 1_700_000_000
 """A wall clock before this (November 2023) has never been set."""
 
@@ -53,6 +55,7 @@ A unit.toml, to begin with:
   armed = []                              # alarms whose repair may act; the others only tell what they would send
   [journal]
   path = "journal.db"
+  monitor_mb = 500                        # history of the monitoring messages (ucs journal --monitor); 0: none is kept
 
 Beside it: `ucs monitor unit.toml` shows it live, `ucs status unit.toml` tells whether all is well, `ucs journal unit.toml`
 what happened, `ucs bridge unit.toml` carries it to level 2. docs/operation.md tells how to run it as a service.
@@ -88,18 +91,20 @@ def run(args: Namespace) -> int:
         for port in ports:
             port.start()
             stack.callback(port.stop)
-        journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name, new_boot=_first_boot()))
+        journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name, new_boot=_first_boot(),
+                                              monitor_bytes=settings.journal.monitor_mb * 1_000_000))
         uplink = stack.enter_context(Uplink(journal, inbox, time.monotonic_ns))
         sources = readings.start(settings, catalog, ports, journal, inbox, stack)
         service = Supervised()
         attendant = Attendant(uplink, sources.house, time.monotonic_ns, service)
-        histories = HistoryReader(settings.bus, inbox.notice)
+        histories = HistoryReader(settings.bus, inbox.notice, inbox.ask)
         stack.callback(histories.stop)
-        live = Live(_supervisor(settings, catalog, journal, own, known), journal, ports, inbox, clock=time.monotonic_ns,
-                    wall=time.time_ns, told=_teller(printer, histories), notice=lambda text: printer.err(f"ucs: {text}"),
-                    link=attendant, house=attendant, gnss=sources.gnss, recorder=sources.recorder, quiet=readings.quiet(settings))
+        supervisor = _supervisor(settings, catalog, own, known, journal, restored(journal, inbox.notice))
+        live = Live(supervisor, journal, ports, inbox, clock=time.monotonic_ns, wall=time.time_ns,
+                    told=_teller(printer, histories), notice=lambda text: printer.err(f"ucs: {text}"), link=attendant,
+                    house=attendant, gnss=sources.gnss, recorder=sources.recorder, quiet=readings.quiet(settings))
         stack.enter_context(attendant.attend(live, journal, sources, settings.unit.fleet))
-        stack.callback(lambda: printer.out("\n".join(_end_lines(live, ports, sources))))
+        stack.callback(lambda: printer.out("\n".join(_end_lines(live, ports, sources, journal))))
         with _ended_by_signals(live):
             printer.out("\n".join(_start_lines(settings, catalog)))
             printer.out(f"boot {journal.boot}, journal {settings.journal.path}; supervising")
@@ -115,20 +120,38 @@ def _first_boot() -> int:
     return now_s if now_s > PLAUSIBLE_S else 1
 
 
-def _supervisor(settings: Config, catalog: Catalog, journal: Journal, own: frozenset[str],
-                known: Sequence[Device]) -> Supervisor:
+def _supervisor(settings: Config, catalog: Catalog, own: frozenset[str], known: Sequence[Device], journal: Journal,
+                state: State | None) -> Supervisor:
     """The supervisor of this boot, with the latches and budgets of the last one."""
     return Supervisor(catalog, unit=settings.unit.name, boot=journal.boot, armed=settings.repairs.armed,
-                      j1939=settings.j1939, restored=_restored(journal),
-                      monitor_ns=settings.bridge.period_ns if settings.bridge else None, readings=own, devices=known,
+                      j1939=settings.j1939, restored=state,
+                      monitor_ns=_monitor_ns(settings), readings=own, devices=known,
                       gnss_bus=settings.gnss_bus)
 
 
-def _restored(journal: Journal) -> State | None:
+def _monitor_ns(settings: Config) -> int | None:
+    """Period of the monitoring messages; None where they neither go up nor are kept."""
+    kept = settings.journal is not None and settings.journal.monitor_mb > 0
+    return settings.bridge.period_ns if settings.bridge else MONITOR_NS if kept else None
+
+
+def restored(journal: Journal, notice: Callable[[str], None]) -> State | None:
+    """The state to begin with: what the journal gives back; None for a new unit. Raises OutsideError.
+
+    Where a journal was and gives none back, nobody knows whether the unit was stopped: it begins as stopped, which the journal
+    keeps at once, and stays so until it is resumed at the machine.
+    """
     stored = journal.restored_state()
-    if stored is None:
+    if journal.state_lost:
         with Reader(journal.path) as reader:
-            return lock_outs(reader)
+            state = State("stopped", lock_outs(reader))
+        notice("the journal gave back no state: nobody knows whether the unit was stopped, so it begins as stopped; "
+               "after a look at the machine: ucs order unit.toml resume")
+        journal.append((), encode_state(state))
+        return state
+    if stored is None:
+        journal.append((), encode_state(State("running", ())))  # from now on a journal without state has lost it
+        return None
     try:
         return decode_state(stored)
     except msgspec.DecodeError as error:
@@ -136,16 +159,15 @@ def _restored(journal: Journal) -> State | None:
                            "out, then set another [journal] path") from None
 
 
-def lock_outs(reader: Reader) -> State | None:
+def lock_outs(reader: Reader) -> tuple[AlarmMemory, ...]:
     """What is locked out by the events alone: where a damaged journal gave back events and no state, no valve may open for that."""
     last: dict[str, Event] = {}
     after = FIRST
     while events := reader.events(after):
         after = (events[-1].boot, events[-1].seq)
         last |= {event.alarm: event for event in events if event.event in ("locked_out", "cleared")}
-    found = tuple(AlarmMemory(event.alarm, LOCKED_OUT, event.instance, False, event.attempt, (), ())
-                  for event in last.values() if event.event == "locked_out")
-    return State("running", found) if found else None
+    return tuple(AlarmMemory(event.alarm, LOCKED_OUT, event.instance, False, event.attempt, (), ())
+                 for event in last.values() if event.event == "locked_out")
 
 
 def _teller(printer: Printer, histories: HistoryReader) -> Callable[[Event], None]:
@@ -187,7 +209,7 @@ def _start_lines(settings: Config, catalog: Catalog) -> Iterator[str]:
         yield f"  traffic recorded in {settings.recorder.path}, at most {settings.recorder.max_mb} MB"
 
 
-def _end_lines(live: Live, ports: list[Port], sources: readings.Sources) -> Iterator[str]:
+def _end_lines(live: Live, ports: list[Port], sources: readings.Sources, journal: Journal) -> Iterator[str]:
     """What became of the frames."""
     yield "stopped"
     for port in ports:
@@ -195,6 +217,8 @@ def _end_lines(live: Live, ports: list[Port], sources: readings.Sources) -> Iter
         yield f"  bus {port.settings.name}: {counts or 'no frame sent'}"
     for word, count in sorted(live.supervisor.counters.items()):
         yield f"  {count} {word}"
+    if journal.unrecorded:
+        yield f"  {journal.unrecorded} monitoring messages not kept"
     if live.dropped:
         yield f"  {live.dropped} frames dropped"
     if sources.gnss is not None:

@@ -83,7 +83,7 @@ class GnssStanding(msgspec.Struct, frozen=True):
 class RunStanding(msgspec.Struct, frozen=True):
     """`ucs run`. turn_age_s: since the loop last did a turn: large means that it hangs, and the rest is as old.
 
-    lateness_s: of the loop, the largest within the last minute or so. mode: running, paused or stopped from above. hidden:
+    lateness_s: of the loop, the largest within the last minute or so. mode: running, paused or stopped. hidden:
     active causes that are not listed. journal_fault, recorder_fault: why nothing is written, empty when it is.
     """
 

@@ -38,7 +38,7 @@ EPILOG = """\
 Exit codes and the first line are those of a Nagios or Icinga plugin:
 
   0 OK        supervised, no alarm
-  1 WARNING   an alarm is active; a bus with errors; paused or stopped from above; the loop is late; the bridge is not
+  1 WARNING   an alarm is active; a bus with errors; paused or stopped; the loop is late; the bridge is not
               running or offline for a minute, or events wait too long; the disk is nearly full; nothing is recorded
   2 CRITICAL  not supervised, or supervision hangs; an alarm is locked out or as grave as --critical says; a bus is off
               or gone; the journal can't be written
@@ -235,7 +235,7 @@ def _judge_run(picture: Picture) -> Iterator[Finding]:
     if run.journal_fault:
         yield Finding(CRITICAL, run.journal_fault)
     if run.mode != "running":
-        yield Finding(WARNING, f"{run.mode} from above")
+        yield Finding(WARNING, "stopped: it is resumed at the machine" if run.mode == "stopped" else f"{run.mode} from above")
     if run.lateness_s > LATE_S:
         yield Finding(WARNING, f"the loop was {run.lateness_s * 1000:.0f} ms late")
     if run.recorder_fault:

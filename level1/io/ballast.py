@@ -25,14 +25,22 @@ class Ballast:
         except OSError:
             return False
 
+    @property
+    def roomy(self) -> bool:
+        """Whether the disk has `MARGIN` times the space free."""
+        try:
+            disk = os.statvfs(self.path.parent)
+        except OSError:
+            return False
+        return disk.f_bavail * disk.f_frsize >= MARGIN * self.size
+
     def take(self) -> bool:
         """Reserve the space, where the disk has enough left; gives `held`."""
         if self.held:
             return True
+        if not self.roomy:
+            return False
         try:
-            disk = os.statvfs(self.path.parent)
-            if disk.f_bavail * disk.f_frsize < MARGIN * self.size:
-                return False
             with open(self.path, "wb") as file:
                 os.posix_fallocate(file.fileno(), 0, self.size)
             return True

@@ -1,8 +1,8 @@
 """CANopen where it touches the world: data sheets (EDS) from disk, and the error history of a device, read by SDO.
 
 The history is read only where the configuration says so (`history = true`), as that sends: requests to read object 0x1003, nothing
-else, at most so many in a time, besides the gate that all else goes through. The answers pass on the bus like everything else, and
-the supervisor takes them from there (`level1.canopen`), so that a replay of the traffic says the same.
+else, at most so many in a time. They leave by the live loop, through the gate that all goes through. The answers pass on the bus
+like everything else, and the supervisor takes them from there (`level1.canopen`), so that a replay of the traffic says the same.
 """
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import dbc
-from level1.canopen import DEVICE_EMERGENCY, HISTORY, LIFE_FACTOR, MAX_HISTORY, SDO_ANSWER, Device
+from level1.canopen import DEVICE_EMERGENCY, HISTORY, LIFE_FACTOR, MAX_HISTORY, SDO_ANSWER, SDO_REQUEST, Device
 from level1.eds import MAX_SIZE, DataSheet, EdsError, parse
 from level1.event import Event
 from level1.io.config import SHORTEST_GUARD_NS, Bus, CanopenDevice, Config, ConfigError
 from level1.io.error import did_you_mean
 
-SDO_REQUEST = 0x600
 ANSWER_S = 0.3
 """A device that has not answered by then is not waited for any longer; the package has a time-out for each answer only."""
 PAUSE_S = 10.0
@@ -51,7 +50,7 @@ def _device(bus: int, device: CanopenDevice) -> Device:
     if guard_ns is None and not heartbeat_ns and sheet.guard_ns:  # a device that has both sends its heartbeat (CiA 301 §7.2.8.3.2)
         guard_ns = max(sheet.guard_ns, SHORTEST_GUARD_NS)
     return Device(bus, device.node, device.name or sheet.name, 0 if guard_ns else heartbeat_ns, device.required, sheet.errors,
-                  guard_ns or None, device.life_factor or sheet.life_factor or LIFE_FACTOR)
+                  guard_ns or None, device.life_factor or sheet.life_factor or LIFE_FACTOR, device.history)
 
 
 def _sheet(name: str) -> DataSheet:
@@ -75,14 +74,19 @@ def _sheet(name: str) -> DataSheet:
         raise EdsError(f"is no data sheet: {error}") from None
 
 
+Ask = Callable[[int, int, bytes], None]
+
+
 class HistoryReader:
     """Reads error histories in a thread of its own, so that supervision waits for no device.
 
-    buses: of the configuration, by index. notice: told of a device that does not answer, in one line. clock: monotonic, s.
+    buses: of the configuration, by index. notice: told of a device that does not answer, in one line. ask: sends a request
+    (bus, identifier, data), or refuses it. clock: monotonic, s.
     """
 
-    def __init__(self, buses: Sequence[Bus], notice: Callable[[str], None], clock: Callable[[], float] = time.monotonic):
+    def __init__(self, buses: Sequence[Bus], notice: Callable[[str], None], ask: Ask, clock: Callable[[], float] = time.monotonic):
         self.read = 0
+        self._ask = ask
         self._buses = buses
         self._notice = notice
         self._clock = clock
@@ -120,7 +124,7 @@ class HistoryReader:
         while (device := self._waiting.get()) is not None and not self._stopping:
             bus, node = device
             try:
-                with _Line(self._buses[bus], node) as line:
+                with _Line(bus, self._buses[bus], node, self._ask) as line:
                     for _ in read_history(line, node):
                         pass
                 self.read += 1
@@ -142,10 +146,11 @@ def read_history(line: Any, node: int) -> Iterator[int]:
 
 
 class _Line:
-    """A bus for one conversation: sends requests, and is the queue from which the package takes the answers."""
+    """A bus for one conversation: hands requests on, sends nothing itself, and is the queue the package takes the answers from."""
 
-    def __init__(self, bus: Bus, node: int):
+    def __init__(self, index: int, bus: Bus, node: int, ask: Ask):
         import can
+        self._index, self._ask = index, ask
         options: Mapping[str, Any] = {"bitrate": bus.bitrate, "fd": bus.fd or None, **bus.options}
         self._bus = can.Bus(interface=bus.interface, channel=bus.channel,
                             can_filters=[{"can_id": SDO_ANSWER + node, "can_mask": 0x7FF, "extended": False}],
@@ -159,9 +164,9 @@ class _Line:
         self._bus.shutdown()
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Send a request."""
-        import can
-        self._bus.send(can.Message(arbitration_id=can_id, is_extended_id=False, data=data), ANSWER_S)
+        """Have a request sent."""
+        if not remote:
+            self._ask(self._index, can_id, bytes(data))
 
     def get(self, block: bool = True, timeout: float | None = None) -> bytes:
         """The next answer. Raises queue.Empty when none comes in time."""

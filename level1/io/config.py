@@ -113,9 +113,11 @@ class Repairs(msgspec.Struct, frozen=True):
 
 
 class JournalFile(msgspec.Struct, frozen=True):
-    """The journal's SQLite file; a relative path counts from the configuration's folder."""
+    """The journal's SQLite file; a relative path counts from the configuration's folder. monitor_mb: megabytes that the history of
+    the monitoring messages may take beside it, the oldest go first; 0: none is kept."""
 
     path: str
+    monitor_mb: int = 500
 
 
 class BridgeSettings(msgspec.Struct, frozen=True):
@@ -300,6 +302,9 @@ def _rule_problems(table: Mapping[str, Any]) -> Iterator[str]:
     max_mb = recorder.get("max_mb")
     if isinstance(max_mb, int) and not 2 <= max_mb <= 10_000_000:
         yield f"recorder.max_mb: {max_mb} is outside 2 to 10000000 megabytes"
+    monitor_mb = _sub(table, "journal").get("monitor_mb")
+    if isinstance(monitor_mb, int) and not 0 <= monitor_mb <= 10_000_000:
+        yield f"journal.monitor_mb: {monitor_mb} is outside 0 to 10000000 megabytes"
     period = health.get("period")
     if (isinstance(period, str) and not list(_duration_problems(period, ""))
             and not FASTEST_HEALTH_NS <= duration_ns(period) <= SLOWEST_HEALTH_NS):
@@ -413,7 +418,7 @@ def _resolved(config: Config, path: str) -> Config:
 
     buses = tuple(msgspec.structs.replace(bus, dbc=tuple(map(definitions, bus.dbc)), canopen=tuple(map(device, bus.canopen)))
                   for bus in config.bus)
-    journal = config.journal and JournalFile(beside(config.journal.path))
+    journal = config.journal and msgspec.structs.replace(config.journal, path=beside(config.journal.path))
     recorder = config.recorder and msgspec.structs.replace(config.recorder, path=beside(config.recorder.path))
     bridge = config.bridge
     if bridge:

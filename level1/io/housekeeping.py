@@ -10,7 +10,8 @@ from level1.health import BUS_STATES, HEALTH, LOAD, Host, Loop, Reading
 JOURNAL_WORDS = (("full", "JournalFull"), ("readonly", "JournalReadOnly"), ("read-only", "JournalReadOnly"),
                  ("malformed", "JournalCorrupt"), ("not a database", "JournalCorrupt"))
 """What the text of a journal's fault says (SQLite's own words among them), and the word of the signal JournalState for it."""
-INCIDENT_WORDS = ((" was corrupt: ", "JournalCorrupt"), (" is too big: ", "JournalFull"))
+INCIDENT_WORDS = ((" was corrupt: ", "JournalCorrupt"), (" is too big: ", "JournalFull"),
+                  (" dropped: the disk is full", "JournalFull"))
 """The same for its incidents."""
 
 

@@ -1,4 +1,4 @@
-"""What waits for the live loop: frames, orders from above, reports and notices about the world; and what wakes it."""
+"""What waits for the live loop: frames, orders, questions to devices, reports and notices about the world; and what wakes it."""
 from __future__ import annotations
 
 import os
@@ -18,6 +18,14 @@ FRAMES = 20_000
 """Frames that wait at most: two seconds of a full 1 Mbit/s bus."""
 
 
+class Request(NamedTuple):
+    """What is to be asked of a device on a bus. can_id: of 11 bits."""
+
+    bus: int
+    can_id: int
+    data: bytes
+
+
 class Load(NamedTuple):
     """What had come since the last `take`. dropped: frames lost because too many waited, the oldest first."""
 
@@ -26,13 +34,14 @@ class Load(NamedTuple):
     reports: Sequence[Report]
     notices: Sequence[str]
     dropped: int
+    requests: Sequence[Request] = ()
 
 
 NOTHING = Load((), (), (), (), 0)
 
 
 class Inbox:
-    """Filled by any thread, emptied by one. Frames are bounded; orders, reports and notices, which are few, are never dropped.
+    """Filled by any thread, emptied by one. Frames are bounded; the others, which are few, are never dropped.
 
     It wakes the one that waits, as do the descriptors it is told to `watch`: of sockets that the loop reads itself.
     rung: whether something has come, or `wake` was called, since the last `take`.
@@ -44,6 +53,7 @@ class Inbox:
         self._orders: list[Order] = []
         self._reports: list[Report] = []
         self._notices: list[str] = []
+        self._requests: list[Request] = []
         self._dropped = 0
         self._lock = threading.Lock()
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -65,6 +75,12 @@ class Inbox:
         """An authenticated order has come."""
         with self._lock:
             self._orders.append(order)
+        self.wake()
+
+    def ask(self, bus: int, can_id: int, data: bytes) -> None:
+        """A device is to be asked, as far as the gate lets it."""
+        with self._lock:
+            self._requests.append(Request(bus, can_id, data))
         self.wake()
 
     def report(self, reports: Iterable[Report]) -> None:
@@ -106,7 +122,7 @@ class Inbox:
             os.eventfd_read(self._bell)
         self.rung = False  # only now: a bell rung before would be silenced, and who comes later would not ring it
         with self._lock:
-            load = Load(list(self._frames), self._orders, self._reports, self._notices, self._dropped)
+            load = Load(list(self._frames), self._orders, self._reports, self._notices, self._dropped, self._requests)
             self._frames.clear()
-            self._orders, self._reports, self._notices, self._dropped = [], [], [], 0
+            self._orders, self._reports, self._notices, self._dropped, self._requests = [], [], [], 0, []
         return load

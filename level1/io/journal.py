@@ -8,7 +8,7 @@ the events wait in memory. The same holds for a full, read-only or broken disk: 
 and what waited is written in order as soon as it can be. Nothing here raises for disk trouble after the opening.
 
 Beside `journal.db` stand `journal.db.boot` (the boot id, in case the journal is lost), `journal.db.ballast` (space for
-alarms on a full disk) and `journal.db.lock` (one writer).
+alarms on a full disk), `journal.db.lock` (one writer) and `journal.db.monitor` (the monitoring history, see `journal_monitor`).
 """
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from itertools import count
 from pathlib import Path
 from typing import IO
 
-from level1.event import Commanded, Event
+from level1.event import Commanded, Event, Monitor
 from level1.io.ballast import Ballast
 from level1.io.bootfile import BootFile
 from level1.io.journal_file import (
@@ -38,6 +38,7 @@ from level1.io.journal_file import (
     is_corrupt,
     set_aside,
 )
+from level1.io.journal_monitor import PIECES, Gatherer, History, Piece
 from level1.io.journal_reader import Reader, read_events
 
 __all__ = ["FIRST", "Journal", "JournalError", "Position", "Reader", "read_events"]
@@ -66,10 +67,11 @@ class Journal:
     boot: id of this opening; higher than every earlier one, on the disk before it is given, never given again.
     new_boot: the boot id to begin with where nothing is left of an earlier journal, not even the boot file: with an
     exchanged card an old unit would begin at 1 again, with the seconds of a wall clock it would not.
+    monitor_bytes: bound of the monitoring history, 0: none is kept.
     """
 
     def __init__(self, path: Path, unit: str, *, new_boot: int = 1, queue_events: int = QUEUE_EVENTS,
-                 keep_bytes: int = KEEP_BYTES, patience_ns: int = PATIENCE_NS):
+                 keep_bytes: int = KEEP_BYTES, patience_ns: int = PATIENCE_NS, monitor_bytes: int = 0):
         self.path = Path(path).absolute()
         self.unit = unit
         self._lock = _locked(self.path)
@@ -86,6 +88,10 @@ class Journal:
         self._changed = threading.Condition()
         self._ballast = Ballast(beside(self.path, ".ballast"))
         self._boot_file = BootFile(beside(self.path, ".boot"))
+        self._gatherer = Gatherer() if monitor_bytes else None
+        self._pieces: deque[Piece] = deque(maxlen=PIECES)
+        self._unpacked = 0
+        self._history = History(self.path, monitor_bytes, self._has_room, self._incidents)
         try:
             self._file, self.boot = self._open(new_boot)
         except BaseException:
@@ -121,6 +127,21 @@ class Journal:
                 self._slow = True
             return self._done >= ticket
 
+    def record(self, monitors: Sequence[Monitor]) -> None:
+        """Keep monitoring messages for the history: about a minute of them in memory, then on the disk. Waits for nothing."""
+        piece = self._gatherer.add(monitors) if self._gatherer is not None else None
+        if piece is not None:
+            with self._changed:
+                if len(self._pieces) == PIECES:
+                    self._unpacked += self._pieces[0].samples
+                self._pieces.append(piece)
+                self._changed.notify_all()
+
+    @property
+    def unrecorded(self) -> int:
+        """Monitoring messages that are not in the history, for want of room or through damage."""
+        return self._unpacked + self._history.lost
+
     @property
     def fault(self) -> str | None:
         """Why events wait in memory or may soon have to; None while the journal works. Worth an alarm."""
@@ -152,8 +173,13 @@ class Journal:
         return self._lost
 
     def restored_state(self) -> bytes | None:
-        """The state as last written before this opening, None in a new journal."""
+        """The state as last written before this opening, None where there is none."""
         return self._restored
+
+    @property
+    def state_lost(self) -> bool:
+        """Whether there was a journal, or its boot file, and it gave no state back: what was ordered before is not known."""
+        return self._restored is None and self._had_earlier
 
     def prune(self, delivered: Mapping[int, int]) -> None:
         """Let the journal shrink to its bound, later, in its own thread: delivered events go first, oldest first.
@@ -167,7 +193,10 @@ class Journal:
 
     def close(self, timeout_s: float = 10.0) -> None:
         """Write what waits, if the disk lets it within the time, and close the file."""
+        rest = self._gatherer.rest() if self._gatherer is not None else None
         with self._changed:
+            if rest is not None:
+                self._pieces.append(rest)
             self._closing = True
             self._changed.notify_all()
         self._thread.join(timeout_s)
@@ -187,7 +216,7 @@ class Journal:
         if boot == 1 < new_boot:
             boot = new_boot
             self._boot_file.write(boot)
-        self._restored = file.state()
+        self._restored, self._had_earlier = file.state(), existed or previous > 0
         self._begin_boot(file, boot)
         return file, boot
 
@@ -196,7 +225,7 @@ class Journal:
         try:
             return JournalFile(self.path, self.unit)
         except sqlite3.DatabaseError as error:
-            if code(error) == sqlite3.SQLITE_FULL and self._ballast.release():
+            if code(error) == sqlite3.SQLITE_FULL and (self._give_up_history() or self._ballast.release()):
                 return JournalFile(self.path, self.unit)
             if not is_corrupt(error):
                 raise
@@ -226,21 +255,42 @@ class Journal:
                 if works and not called:
                     self._take_ballast()
                     continue
-                closing, ticket = self._closing, self._asked
+                closing, ticket, idle = self._closing, self._asked, works and not self._has_orders()
+                pieces = tuple(self._pieces)
+                self._pieces.clear()
                 batch, state, commands = tuple(self._queue), self._state, tuple(self._commands)
                 delivered, self._delivered = self._delivered, None
-            start_ns = time.monotonic_ns()
-            trouble = self._attempt(batch, state, commands)
-            slow = time.monotonic_ns() - start_ns > self._patience_ns
-            with self._changed:
-                self._settle(ticket, batch, trouble, slow)
-                if not trouble:
-                    self._forget(commands)
-            if delivered is not None and not trouble:
-                self._drop(delivered)
+            if not idle:
+                self._write_events(ticket, batch, state, commands, delivered)
+            self._history.take(pieces, self.boot)
             if closing:
+                self._history.write(self.boot)
+                self._history.close()
                 self._file.close()
                 return
+
+    def _write_events(self, ticket: int, batch: Sequence[Event], state: bytes | None, commands: Commands,
+                      delivered: Mapping[int, int] | None) -> None:
+        start_ns = time.monotonic_ns()
+        trouble = self._attempt(batch, state, commands)
+        slow = time.monotonic_ns() - start_ns > self._patience_ns
+        with self._changed:
+            self._settle(ticket, batch, trouble, slow)
+            if not trouble:
+                self._forget(commands)
+        if delivered is not None and not trouble:
+            self._drop(delivered)
+
+    def _has_room(self) -> bool:
+        """Whether the monitoring history may be written: never while events can't be, nor near the reserve of a full disk."""
+        return not self._trouble and self._ballast.held and self._ballast.roomy
+
+    def _give_up_history(self) -> bool:
+        """Give the room of the monitoring history to events. False when there was none."""
+        given = self._history.remove()
+        if given:
+            self._incidents.append(f"monitoring history of {self.path} dropped: the disk is full")
+        return given
 
     def _take_ballast(self) -> None:
         if not self._ballast.held and self._ballast.take():
@@ -248,6 +298,9 @@ class Journal:
                 self._file.save_space(False)
 
     def _has_work(self) -> bool:
+        return self._has_orders() or bool(self._pieces)
+
+    def _has_orders(self) -> bool:
         return self._closing or self._asked > self._tried or self._delivered is not None
 
     def _settle(self, ticket: int, batch: Sequence[Event], trouble: str, slow: bool) -> None:
@@ -295,14 +348,17 @@ class Journal:
 
     def _commit_on_full_disk(self, batch: Sequence[Event], state: bytes | None, commands: Commands) -> None:
         self._file.reuse_log()
-        try:
-            self._file.commit(self.boot, batch, state, commands)
-        except sqlite3.Error as error:
-            if code(error) != sqlite3.SQLITE_FULL or not self._ballast.release():
-                raise
-            self._file.save_space(True)
-            self._file.reuse_log()
-            self._file.commit(self.boot, batch, state, commands)
+        while True:
+            try:
+                return self._file.commit(self.boot, batch, state, commands)
+            except sqlite3.Error as error:
+                if code(error) != sqlite3.SQLITE_FULL:
+                    raise
+                if not self._give_up_history():
+                    if not self._ballast.release():
+                        raise
+                    self._file.save_space(True)
+                self._file.reuse_log()
 
     def _replace(self) -> None:
         gone = not self.path.exists()

@@ -149,8 +149,10 @@ class JournalFile:
             saved = self.connection.total_changes - before
             for row in _readable(old, "SELECT boot, number, line FROM command"):
                 self.connection.execute(INSERT_COMMAND, row)
+            newest = scalar(self.connection, "SELECT max(boot) FROM event")
             for boot, snapshot in _readable(old, "SELECT boot, snapshot FROM state"):
-                if isinstance(boot, int) and isinstance(snapshot, bytes):
+                # written with every event: one of an earlier boot than the newest event is out of date
+                if isinstance(boot, int) and isinstance(snapshot, bytes) and boot >= newest:
                     self.connection.execute("INSERT OR REPLACE INTO state VALUES (1, ?, ?)", (boot, snapshot))
             return saved
         finally:
@@ -165,7 +167,7 @@ class JournalFile:
         connection = self.connection
         version = scalar(connection, "PRAGMA user_version")
         if version > len(MIGRATIONS):
-            raise too_new(self.path, version)
+            raise too_new(self.path, version, len(MIGRATIONS))
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = FULL")
         connection.execute("PRAGMA cell_size_check = ON")
@@ -218,7 +220,7 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
     if not path.is_file():
         raise JournalError(f"journal {path}: no such file; give the path of one that `ucs run` wrote")
     try:
-        connection = _read_only(path)
+        connection = read_only(path)
         version, mark = scalar(connection, "PRAGMA user_version"), scalar(connection, "PRAGMA application_id")
     except sqlite3.Error as error:
         raise unreadable(path, error) from None
@@ -226,11 +228,12 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
         return connection
     connection.close()
     if mark == APPLICATION_ID and version:
-        raise too_new(path, version)
+        raise too_new(path, version, len(MIGRATIONS))
     raise JournalError(f"journal {path}: not a journal; give the path of one that `ucs run` wrote")
 
 
-def _read_only(path: Path) -> sqlite3.Connection:
+def read_only(path: Path) -> sqlite3.Connection:
+    """A connection that can't write, and works on a read-only disk. Raises sqlite3.Error."""
     uri = path.absolute().as_uri() + "?mode=ro"
     connection = sqlite3.connect(uri, uri=True, timeout=1.0, isolation_level=None, check_same_thread=False)
     try:
@@ -285,9 +288,8 @@ def unreadable(path: Path, error: Exception) -> JournalError:
     return JournalError(f"journal {path}: can't be read ({error}); `ucs run` sets a corrupt one aside and begins anew")
 
 
-def too_new(path: Path, version: int) -> JournalError:
-    """The error of a journal from a later version of this program."""
-    known = len(MIGRATIONS)
+def too_new(path: Path, version: int, known: int) -> JournalError:
+    """The error of a file from a later version of this program."""
     return JournalError(f"journal {path}: written by a later version (schema {version}, this one knows {known}); "
                         "install that version, or set another [journal] path")
 

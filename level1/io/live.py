@@ -63,6 +63,9 @@ class EventStore(Protocol):
     def append(self, events: Sequence[Event], state: bytes, commands: Sequence[Commanded] = ()) -> bool:
         """Write events, commands and the state after them; True when they are on the disk."""
 
+    def record(self, monitors: Sequence[Monitor]) -> None:
+        """Keep monitoring messages; waits for nothing."""
+
     @property
     def fault(self) -> str | None:
         """Why events are not on the disk."""
@@ -189,6 +192,8 @@ class Live:
         if served_ns > self._served_ns:
             self._served_ns = served_ns
         commands = [self._command(order, outputs) for order in load.orders] if load.orders else ()
+        for request in load.requests:
+            outputs.extend(supervisor.ask(*request, self._served_ns))
         deadline = supervisor.next_deadline()
         if deadline is not None and deadline <= self._served_ns:
             outputs.extend(supervisor.tick(self._served_ns))
@@ -339,6 +344,9 @@ class Live:
         self._retry_ns = min(retries, default=None)
         if self._link is not None:
             self._link.publish(events, upward)
+        monitors = [output for output in upward if isinstance(output, Monitor)]
+        if monitors:
+            self.journal.record(monitors)
         for event in events:
             self._told(event)
         self._tell_journal()

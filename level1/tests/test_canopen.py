@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from level1.canopen import BOOT_NS, ERRORS, MARGIN, MAX_ERRORS, Device, describe, outlives, parse_emergency
+from level1.canopen import BOOT_NS, ERRORS, MARGIN, MAX_ERRORS, SDO, Device, describe, outlives, parse_emergency
 from level1.catalog import Message, Repair
 from level1.command import Order
 from level1.event import Event, Output, Result, Send
 from level1.expression import Boolean, SendStep
 from level1.frame import BUS_SHIFT, EXTENDED, REMOTE, Frame, frame_key
+from level1.gate import BURST
 from level1.supervisor import Supervisor
 from level1.tests.build import MS, SECOND, alarm, compare, message, signal, supervisor
 
@@ -500,3 +501,48 @@ def test_one_by_one_and_in_batches_give_the_same_and_what_is_raised_is_cleared_b
 def test_any_bytes_are_an_emergency_or_none(data: bytes) -> None:
     parsed = parse_emergency(data)
     assert (parsed is None) == (len(data) != 8)
+
+
+# --- reading error histories ------------------------------------------------------------------------------------------------
+
+
+READABLE = msgspec.structs.replace(SPRAYER, history=True)
+READ = bytes([0x40, 0x03, 0x10, 1, 0, 0, 0, 0])
+
+
+def asked(target: Supervisor, data: bytes, node: int = 42, bus: int = 0) -> list[bytes]:
+    """What leaves for a request; a moment later, so that the limit on their number is not met."""
+    outputs = target.ask(bus, 0x600 + node, data, target.now_ns + SECOND)
+    return [output.data for output in outputs if isinstance(output, Send) and output.message == SDO]
+
+
+def test_of_all_sdo_requests_only_those_that_read_the_error_history_leave() -> None:
+    target = unit(READABLE, start_ns=0, broadcast=True)
+    passed = {first for first in range(256) if asked(target, bytes([first]) + READ[1:])}
+    assert passed == {0x40, 0x60, 0x70, 0x80}, "no download (0x2x, 0x0x, 0x1x), no blocks"
+    assert target.counters["frames refused by the gate"] == 252
+    for data in (b"", READ[:7], READ + b"\0", b"\x40\x18\x10" + READ[3:], b"\x40\x03\x20" + READ[3:]):
+        assert asked(target, data) == [], "of another length, or of another object"
+
+
+@given(data=st.binary(max_size=9), can_id=st.integers(0, 0x7FF), bus=st.integers(0, 2))
+@settings(max_examples=100, deadline=None)
+def test_nothing_else_can_be_sent_by_asking(data: bytes, can_id: int, bus: int) -> None:
+    target = unit(READABLE, start_ns=0, broadcast=True)
+    sent = [output for output in target.ask(bus, can_id, data, SECOND) if isinstance(output, Send) and output.message == SDO]
+    assert not sent or (bus, can_id) == (0, 0x62A) and data[0] in (0x40, 0x60, 0x70, 0x80) and len(data) == 8
+
+
+def test_only_devices_whose_history_is_wanted_are_asked_for_it_and_on_their_bus() -> None:
+    target = unit(READABLE, msgspec.structs.replace(SPRAYER, node=43), start_ns=0, broadcast=True)
+    assert asked(target, READ) == [READ]
+    assert asked(target, READ, node=43) == asked(target, READ, node=44) == asked(target, READ, bus=1) == []
+    assert asked(unit(READABLE, start_ns=0, broadcast=False), READ) == [], "nothing is sent in a replay"
+
+
+def test_requests_have_a_limit_and_are_soon_out_of_date() -> None:
+    target = unit(READABLE, start_ns=0, broadcast=True)
+    outputs = [output for _ in range(1000) for output in target.ask(0, 0x62A, READ, SECOND) if isinstance(output, Send)]
+    requests = [output for output in outputs if output.message == SDO]
+    assert len(requests) == BURST and target.counters["frames refused by the gate"] == 1000 - BURST
+    assert requests[0].expires_ns == SECOND + 200 * MS

@@ -13,11 +13,13 @@ import canopen
 import pytest
 
 import dbc
-from level1.canopen import LIFE_FACTOR, Device
-from level1.event import Event, seconds
+from level1.canopen import LIFE_FACTOR, SDO, Device
+from level1.event import Event, Send, seconds
 from level1.io import config
-from level1.io.canopen import HistoryReader, devices
+from level1.io.canopen import HistoryReader, _Line, devices
 from level1.io.config import Bus, CanopenDevice
+from level1.io.definitions import load as load_definitions
+from level1.supervisor import Supervisor
 
 UNIT = """
 [unit]
@@ -123,13 +125,37 @@ def sprayer(channel: str) -> Iterator[Sprayer]:
     device.network.disconnect()
 
 
+class Loop:
+    """Stands for the live loop: what its supervisor lets pass goes out on a bus of its own. sent: what left."""
+
+    def __init__(self, channel: str):
+        self.supervisor = Supervisor(load_definitions(["ucs.dbc"]), unit="tractor-7", start_ns=0,
+                                     devices=[Device(0, 42, history=True), Device(0, 43)])
+        self.supervisor.tick(0)
+        self.bus = can.Bus(interface="virtual", channel=channel)
+        self.sent: list[bytes] = []
+
+    def ask(self, bus: int, can_id: int, data: bytes) -> None:
+        for output in self.supervisor.ask(bus, can_id, data, self.supervisor.now_ns + 1):
+            if isinstance(output, Send) and output.message == SDO:
+                self.sent.append(output.data)
+                self.bus.send(can.Message(arbitration_id=output.key & 0x7FF, is_extended_id=False, data=output.data))
+
+
 @pytest.fixture
-def reader(channel: str) -> Iterator[Callable[..., HistoryReader]]:
+def loop(channel: str) -> Iterator[Loop]:
+    one = Loop(channel)
+    yield one
+    one.bus.shutdown()
+
+
+@pytest.fixture
+def reader(channel: str, loop: Loop) -> Iterator[Callable[..., HistoryReader]]:
     started: list[HistoryReader] = []
 
     def start(notice: Callable[[str], None], interface: str = "virtual", clock: Callable[[], float] = lambda: 0.0) -> HistoryReader:
         bus = Bus("implement", channel, interface=interface, canopen=(CanopenDevice(42, history=True), CanopenDevice(43)))
-        started.append(HistoryReader([bus], notice, clock))
+        started.append(HistoryReader([bus], notice, loop.ask, clock))
         return started[-1]
     yield start
     for one in started:
@@ -187,3 +213,22 @@ def test_a_bus_that_can_not_be_opened_is_told_and_the_reader_lives_on(reader: Ca
     one.told(emergency())
     wait_for(lambda: bool(notices))
     assert len(notices) == 1 and "can't be read" in notices[0]
+
+
+def test_what_the_package_would_write_does_not_leave_and_what_it_reads_does(channel: str, sprayer: Sprayer, loop: Loop) -> None:
+    package: Any = canopen
+    sprayer.remember(0x3120)
+    with _Line(0, Bus("implement", channel, interface="virtual"), 42, loop.ask) as line:
+        client = package.sdo.SdoClient(0x62A, 0x5AA, package.ObjectDictionary())
+        client.network = client.responses = line
+        client.RESPONSE_TIMEOUT = 0.05
+        assert client.upload(0x1003, 1)[:2] == b"\x20\x31"
+        assert [request[0] for request in loop.sent] == [0x40]
+        for size in (1, 4, 100):
+            with pytest.raises(package.SdoCommunicationError):
+                client.download(0x1003, 0, bytes(size))
+        with pytest.raises(package.SdoCommunicationError):
+            client.upload(0x1018, 1)
+    assert {request[0] for request in loop.sent} <= {0x40, 0x80}, "nothing that writes"
+    assert sprayer.node.get_data(0x1003, 0) == b"\1"
+    assert loop.supervisor.counters["frames refused by the gate"] >= 4

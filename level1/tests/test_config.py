@@ -75,6 +75,14 @@ def test_mistakes_about_recorder_and_health(tmp_path: Path, more: str, problem: 
     assert problems(tmp_path, GOOD + more) == [problem]
 
 
+def test_the_monitoring_history_has_a_bound(tmp_path: Path) -> None:
+    path = 'path = "/var/lib/ucs/journal.db"'
+    journal = load(tmp_path, GOOD.replace(path, f"{path}\nmonitor_mb = 0")).journal
+    assert journal == config.JournalFile("/var/lib/ucs/journal.db", 0)
+    assert problems(tmp_path, GOOD.replace(path, f"{path}\nmonitor_mb = -1")) == [
+        "journal.monitor_mb: -1 is outside 0 to 10000000 megabytes"]
+
+
 def test_the_smallest_configuration_arms_nothing(tmp_path: Path) -> None:
     loaded = load(tmp_path, '[unit]\nname = "a"\n[[bus]]\nname = "b"\nchannel = "can0"\ndbc = ["ucs.dbc"]\n')
     assert loaded.repairs.armed == () and loaded.journal is None and loaded.bridge is None

@@ -19,6 +19,7 @@ from level1.event import Commanded, Event, SentFrame, encode, seconds
 from level1.io import journal_file
 from level1.io.bootfile import BootFile
 from level1.io.journal import Journal, JournalError, Reader, read_events
+from level1.io.journal_file import JournalFile
 
 ROOT = Path(__file__).parents[2]
 
@@ -240,6 +241,15 @@ def test_what_a_corrupt_journal_still_gives_is_saved(path: Path) -> None:
         assert f"{len(saved)} events saved" in journal.incidents[0]
 
 
+def test_a_state_older_than_the_newest_event_that_was_saved_is_none(tmp_path: Path) -> None:
+    for state_boot, given in ((2, b"stopped"), (1, None)):
+        kept, anew = (JournalFile(tmp_path / f"{name}-{state_boot}.db", "tractor-7") for name in ("kept", "anew"))
+        kept.commit(state_boot, events(1, boot=2), b"stopped")
+        kept.close()
+        assert anew.salvage(kept.path) == 1 and anew.state() == given
+        anew.close()
+
+
 @pytest.mark.fault("journal taken away, corrupted or replaced while running",
                    "begun anew with the same boot id, told; readers follow")
 def test_corruption_while_running_is_survived_with_the_same_boot_id(path: Path) -> None:
@@ -377,7 +387,8 @@ def on_small_disk(script: str, folder: Path) -> str:
 
 
 @pytest.mark.fault("disk full",
-                   "alarms go on into a reserve of 1 MiB, then wait in memory and leave by radio; all written once there is room")
+                   "the monitoring history goes first; alarms go on into a reserve of 1 MiB, then wait in memory and leave by "
+                   "radio; all written once there is room")
 def test_a_full_disk_gives_its_reserve_to_alarms_and_recovers(tmp_path: Path) -> None:
     assert "events wait in memory" in on_small_disk(FULL_DISK, tmp_path / "disk")
 

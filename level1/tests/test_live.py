@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from level1.bus_health import Report
+from level1.canopen import Device
 from level1.catalog import Catalog
 from level1.command import Order
 from level1.decode import encode
@@ -466,6 +467,9 @@ class Journal:
         self.log.append(("journal", [event.event for event in events]))
         return self.fault is None
 
+    def record(self, monitors: Sequence[Monitor]) -> None:
+        self.log.append(("history", [monitor.message for monitor in monitors]))
+
 
 @pytest.fixture(scope="module")
 def catalog() -> Catalog:
@@ -576,6 +580,16 @@ class TestLive:
         unit.port._adopt(adapted(unit.wire))
         assert [entry[1] for entry in unit.turn_at(1_004)] == [0x650]
 
+    def test_a_device_is_asked_through_the_gate_which_lets_nothing_pass_that_writes(self) -> None:
+        unit = Unit(load(["ucs.dbc"]), devices=[Device(0, 42, history=True)])
+        unit.turn_at(1_002)
+        read, write = bytes([0x40, 0x03, 0x10, 0, 0, 0, 0, 0]), bytes([0x2F, 0x03, 0x10, 0, 0, 0, 0, 0])
+        for data in (write, read):
+            unit.inbox.ask(0, 0x62A, data)
+        assert [entry for entry in unit.turn_at(1_004) if entry[0] == "bus" and entry[1] >= 0x580 and entry[1] < 0x680] == [
+            ("bus", 0x62A, read)]
+        assert unit.live.supervisor.counters["frames refused by the gate"] == 1
+
     def test_an_order_is_answered_upward_and_its_effect_stored(self, catalog: Catalog) -> None:
         unit = Unit(catalog)
         unit.turn_at(1_002)
@@ -596,13 +610,14 @@ class TestLive:
         assert (late.id, late.outcome, late.frames) == ("c2", "refused", ())
         assert late.reason == "expired before supervision could obey it"
 
-    def test_monitoring_goes_upward_and_not_into_the_journal(self, catalog: Catalog) -> None:
+    def test_monitoring_goes_upward_and_then_into_the_history_without_a_commit(self, catalog: Catalog) -> None:
         unit = Unit(catalog, monitor_ns=250 * MS)
         unit.turn_at(1_002)
         unit.status(1_003 * MS)
         happened = unit.turn_at(1_253)
         assert {entry[1].message for entry in happened if entry[0] == "link"} == {"implement", "burners"}
         assert not [entry for entry in happened if entry[0] == "journal"]
+        assert happened[-1] == ("history", ["implement", "burners"])
 
     def test_utc_is_a_label_that_follows_the_wall_clock(self, catalog: Catalog) -> None:
         unit = Unit(catalog)

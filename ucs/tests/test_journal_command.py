@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from level1.event import Commanded, Event, SentFrame, decode, decode_commanded, seconds
+from level1.event import Commanded, Event, Monitor, SentFrame, decode, decode_commanded, decode_monitor, seconds
 from level1.io.journal import Journal
 from ucs.main import main
 
@@ -174,5 +174,66 @@ def test_following_shows_events_as_they_come(tmp_path: Path) -> None:
 def test_mistakes_are_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], args: list[str], told: str) -> None:
     (tmp_path / "unit.toml").write_text(CONFIG)
     assert main(["journal", str(tmp_path / args[0]), *args[1:]]) == 2
+    error = capsys.readouterr().err
+    assert told in error and error.count("\n") == 1
+
+
+# --- the monitoring history -------------------------------------------------------------------------------------------------
+
+
+def a_sample(second: int, message: str = "motion", speed: float | None = 1.5, trusted: bool = True) -> Monitor:
+    return Monitor("tractor-7", 1, seconds(second * 10**9), f"2025-05-01T10:{second // 60:02}:{second % 60:02}.000000Z", trusted,
+                   message, {"Speed": speed}, {"Speed": 0.02}, {"Speed": "good" if speed else "stale"})
+
+
+SAMPLES = [a_sample(0), a_sample(1, "nozzles"), a_sample(2, speed=None), a_sample(70, trusted=False)]
+
+
+@pytest.fixture
+def history(tmp_path: Path) -> Path:
+    """A journal with a history of two batches."""
+    with Journal(tmp_path / "monitored.db", "tractor-7", monitor_bytes=10**6) as journal:
+        journal.record(SAMPLES[:3])
+        journal.record(SAMPLES[3:])
+        journal.record([a_sample(71, "nozzles")])
+    return tmp_path / "monitored.db"
+
+
+def test_the_monitoring_history_is_listed_one_sample_a_line(history: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert shown(capsys, history, "--monitor", "motion").splitlines() == [
+        "2025-05-01T10:00:00.000000Z  1  motion  Speed=1.5",
+        "2025-05-01T10:00:02.000000Z  1  motion  Speed=(stale)",
+        "2025-05-01T10:01:10.000000Z  1  motion  Speed=1.5 (clock not synchronised)"]
+    assert "    Speed = - (stale, 0.020 s old)" in shown(capsys, history, "--monitor", "motion", "--values").splitlines()
+
+
+@pytest.mark.parametrize(("options", "times"), [
+    ([], [0, 1, 2, 70, 71]),
+    (["--since", "2025-05-01T10:00:02"], [2, 70, 71]),
+    (["--until", "2025-05-01T10:00:02"], [0, 1]),
+    (["--last", "2"], [70, 71]),
+    (["--last", "3", "--until", "2025-05-01T10:01:11"], [1, 2, 70]),
+    (["--boot", "2"], []),
+])
+def test_samples_are_chosen(history: Path, capsys: pytest.CaptureFixture[str], options: list[str], times: list[int]) -> None:
+    lines = shown(capsys, history, "--format", "jsonl", *options, "--monitor").splitlines()
+    assert [decode_monitor(line).t for line in lines] == times
+
+
+def test_csv_has_a_row_for_each_sample(history: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = list(csv.DictReader(io.StringIO(shown(capsys, history, "--monitor", "motion", "--format", "csv"))))
+    assert [(row["message"], json.loads(row["values"])) for row in rows] == [
+        ("motion", {"Speed": 1.5}), ("motion", {"Speed": None}), ("motion", {"Speed": 1.5})]
+
+
+@pytest.mark.parametrize(("args", "told"), [
+    (["monitored.db", "--monitor", "motoin"], 'no such monitoring message; did you mean "motion"?'),
+    (["monitored.db", "--monitor", "--follow"], "`ucs monitor unit.toml` shows it live"),
+    (["monitored.db", "--monitor", "--alarm", "X"], "--monitor --alarm: leave one of the two out"),
+    (["other.db", "--monitor"], "other.db.monitor: no such file; `ucs run` writes it a minute after it was started"),
+])
+def test_mistakes_about_the_history_are_told_in_one_line(
+        history: Path, capsys: pytest.CaptureFixture[str], args: list[str], told: str) -> None:
+    assert main(["journal", str(history.with_name(args[0])), *args[1:]]) == 2
     error = capsys.readouterr().err
     assert told in error and error.count("\n") == 1

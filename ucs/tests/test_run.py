@@ -4,6 +4,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,13 +14,16 @@ import can
 import pytest
 
 from level1.catalog import LOCKED_OUT
+from level1.command import Order
 from level1.decode import encode
 from level1.event import Event, seconds
 from level1.io.definitions import load
-from level1.io.journal import Journal, Reader, read_events
+from level1.io.journal import Journal, read_events
+from level1.io.live import encode_state
+from level1.memory import State
 from level1.supervisor import Supervisor
 from ucs.main import main
-from ucs.run import lock_outs
+from ucs.run import restored
 
 UNIT = """
 [unit]
@@ -101,6 +105,8 @@ def test_an_alarm_is_told_repaired_stored_and_broadcast(
     stored = read_events(unit.parent / "journal.db")
     assert [(event.unit, event.boot, event.seq, event.event) for event in stored][:2] == [
         ("tractor-7", int(told[1]), 1, "raised"), ("tractor-7", int(told[1]), 2, "repair_started")]
+    assert main(["journal", str(unit), "--monitor", "implement"]) == 0
+    assert "  implement  Flaming=On" in capsys.readouterr().out
 
 
 def test_ctrl_c_ends_it_with_0_and_the_next_start_is_a_new_boot(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -152,10 +158,67 @@ def test_a_lock_out_survives_a_journal_of_which_only_events_could_be_saved(tmp_p
                         for seq, (alarm, word) in enumerate([("Igniter", "locked_out"), ("PilotFlameOut", "locked_out"),
                                                              ("Igniter", "cleared")], 1)], b"{}")
     path.write_bytes(b"not a database at all" + path.read_bytes()[21:])
-    with Journal(path, "tractor-7") as journal, Reader(path) as reader:
+    with Journal(path, "tractor-7") as journal:
         assert journal.restored_state() is None
-        state = lock_outs(reader)
+        state = restored(journal, lambda text: None)
         supervisor = Supervisor(load(["flaming_tool.dbc"]), unit="tractor-7", boot=2, start_ns=0, restored=state)
         supervisor.tick(1)
     assert supervisor.alarm_states()["PilotFlameOut"] == LOCKED_OUT
     assert [memory.name for memory in state.alarms] == ["PilotFlameOut"] if state else False
+
+
+def forget(path: Path) -> None:
+    path.unlink()
+
+
+def spoil(path: Path) -> None:
+    path.write_bytes(b"not a database at all" + path.read_bytes()[21:])
+
+
+def lose_the_state(path: Path) -> None:
+    with sqlite3.connect(path) as connection:
+        connection.execute("DELETE FROM state")
+    connection.close()
+
+
+@pytest.mark.fault("journal that gives no state back",
+                   "the unit begins as stopped, stays so over restarts, and is resumed at the machine only; told, and an alarm")
+@pytest.mark.parametrize("harm", [forget, spoil, lose_the_state])
+def test_a_unit_whose_journal_gives_no_state_back_begins_as_stopped(tmp_path: Path, harm: Callable[[Path], None]) -> None:
+    path = tmp_path / "journal.db"
+    notices: list[str] = []
+    with Journal(path, "tractor-7") as journal:
+        journal.append((), encode_state(State("stopped", ())))
+    harm(path)
+    for _ in range(2):
+        with Journal(path, "tractor-7") as journal:
+            state = restored(journal, notices.append)
+            assert state is not None and state.mode == "stopped"
+    assert len(notices) == 1 and "begins as stopped" in notices[0], "the second time the journal says so itself"
+    unit = Supervisor(load(["flaming_tool.dbc"]), unit="tractor-7", boot=3, start_ns=0, restored=state)
+    unit.tick(0)
+    repair = unit.catalog.alarms["PilotFlameOut"].repair
+    assert repair and unit.forbidden(repair) == "the unit is stopped"
+    for order, mode in ((Order("c-1", "resume"), "stopped"), (Order("c-2", "resume", origin="local"), "running")):
+        unit.command(order, 1)
+        assert unit.mode == mode
+
+
+def test_the_journal_tells_why_it_gives_no_state_back(tmp_path: Path) -> None:
+    for harm, why in ((forget, "was gone"), (spoil, "was corrupt")):
+        path = tmp_path / harm.__name__ / "journal.db"
+        with Journal(path, "tractor-7") as journal:
+            journal.append((), b"{}")
+        harm(path)
+        with Journal(path, "tractor-7") as journal:
+            assert journal.state_lost and len(journal.incidents) == 1 and why in journal.incidents[0]
+
+
+def test_a_new_unit_begins_as_running(tmp_path: Path) -> None:
+    notices: list[str] = []
+    for _ in range(2):
+        with Journal(tmp_path / "journal.db", "tractor-7") as journal:
+            assert not journal.state_lost
+            state = restored(journal, notices.append)
+            assert state is None or state.mode == "running"
+    assert state is not None and notices == []

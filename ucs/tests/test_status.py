@@ -62,7 +62,7 @@ def silent(why: Silence) -> Picture:
     (changed(buses=(msgspec.structs.replace(BUS, state="BusDown"),)), CRITICAL, "bus implement (can0) is gone"),
     (changed(buses=(msgspec.structs.replace(BUS, state="BusPassive"),)), WARNING, "bus implement (can0) is error passive"),
     (changed(journal_fault="journal j: can't be written (disk full)"), CRITICAL, "journal j: can't be written (disk full)"),
-    (changed(mode="stopped"), WARNING, "stopped from above"),
+    (changed(mode="stopped"), WARNING, "stopped: it is resumed at the machine"),
     (changed(lateness_s=0.25), WARNING, "the loop was 250 ms late"),
     (changed(recorder="/r", recorder_fault="/r: disk full"), WARNING, "traffic is not recorded: /r: disk full"),
     (changed(version="0.9"), WARNING, "version 0.9 runs, 1.0 is installed; restart it"),
@@ -103,7 +103,7 @@ def test_the_first_line_holds_no_bar_that_a_plugin_would_cut_at() -> None:
     (RepairStanding("running", 2, 2, 3, 2, 7, "wait 30 s", 12.4), ", attempt 2 of 3: wait 30 s, 12 s left"),
     (RepairStanding("pausing", 1, 1, 3, left_s=5.0), ", attempt 1 of 3: pauses, 5.0 s left"),
     (RepairStanding("pausing", 1, 2, 3, left_s=5.0), ", attempt 1 (2 of 3 of the budget used): pauses, 5.0 s left"),
-    (RepairStanding("waiting", 0, 0, 3, obstacle="paused from above"), ", attempt 0 of 3: waits, paused from above"),
+    (RepairStanding("waiting", 0, 0, 3, obstacle="the unit is paused"), ", attempt 0 of 3: waits, the unit is paused"),
     (RepairStanding("passive", 0, 0, 3), ", its repair is not armed"),
     (RepairStanding("idle", 0, 0, 3), ""),
 ])
