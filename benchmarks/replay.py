@@ -93,7 +93,7 @@ def _arguments() -> Namespace:
     parser.add_argument("--rounds", type=int, default=2, help="how often each is timed (default %(default)s)")
     parser.add_argument("--frames", type=int, default=10_000_000, metavar="N",
                         help="of the long recording; 100000000 takes 5 GB of disk (default %(default)s)")
-    parser.add_argument("--shared", type=int, default=16_000_000, metavar="N",
+    parser.add_argument("--shared", type=int, default=96_000_000, metavar="N",
                         help=f"frames of the {SHARES} recordings in the folder for two cores (default %(default)s)")
     parser.add_argument("--mf4-python", default=sys.executable, metavar="PYTHON", help="a Python with asammdf, for the peer's MF4")
     parser.add_argument("--folder", metavar="FOLDER", help="where recordings are put meanwhile (default: as the system says)")
