@@ -153,7 +153,7 @@ class FlamingTool(Node):
         self._sensor.advance(t_ns, self.plant.flame)
         flame = self._sensor.sees
         self.safeguard.advance(t_ns, gas=gas, spark=command["Igniter"] == "On", fresh=fresh, flame=flame,
-                               closed=self._valve.position == "Closed" and self.plant.line_bar < TIGHT_BAR)
+                               closed=self._closed)
         if gas:
             self._gas_wanted_ns = t_ns
         self._follow(t_ns, fresh and t_ns - self._gas_wanted_ns < MODE_END_NS, flame)
@@ -174,6 +174,12 @@ class FlamingTool(Node):
         for number, burner in enumerate(self._burners, 1):
             wanted = self._command[f"Burner{number}"] if burning else "Off"
             burner.advance(t_ns, str(wanted) if wanted in ("Low", "High") else "Off")
+
+    @property
+    def _closed(self) -> bool:
+        """Gas valve and burners, and the line between them empty: a burner that stayed open would let gas out at the next start."""
+        return (self._valve.position == "Closed" and self.plant.line_bar < TIGHT_BAR
+                and all(burner.position == "Off" for burner in self._burners))
 
     @property
     def _opening(self) -> float:

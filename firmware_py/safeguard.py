@@ -5,7 +5,7 @@ strictest figures of DESIGN §5):
 
     Purging, Ready, FlameLost, IgnitionFailed, CommandsLost: valve closed, no spark
         ──demand changes from Closed to Open together with Igniter On──▶ Ignition
-        ──valve closed and tight, no flame, for 30 s──▶ Ready    (CommandsLost: and commands are back)
+        ──valve and burners closed, tight, no flame, for 30 s──▶ Ready    (CommandsLost: and commands are back)
     Ignition: valve open, spark as demanded
         ──flame seen──▶ Running      ──3 s──▶ IgnitionFailed
     Running: valve open, no spark
@@ -50,7 +50,7 @@ class Safeguard:
 
     def advance(self, now_ns: int, *, gas: bool, spark: bool, fresh: bool, flame: bool, closed: bool) -> None:
         """One tick. gas, spark: what is commanded; fresh: commands come; flame: sensor; closed: the valve is
-        fully closed and tight."""
+        fully closed and tight, and so are the burners."""
         if fresh and not gas:
             self._armed = True
         if flame:

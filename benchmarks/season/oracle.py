@@ -64,7 +64,9 @@ def _unlit(w: World, n: int) -> bool:
 def _wrong_burner(w: World, n: int) -> bool:
     tool, command = w.flamer, w.command("FLAMER_CMD")
     wanted = tuple(command.get(f"Burner{number}") for number in range(1, 5))
-    return tool.talks and tool.works and tool.sees_flame and bool(command) and wanted != tool.burner_positions
+    if tool.works and tool.safeguard.state == "Running":
+        return tool.talks and tool.sees_flame and bool(command) and wanted != tool.burner_positions
+    return tool.talks and any(position != "Off" for position in tool.burner_positions)
 
 
 def _wrong_mode(w: World, n: int) -> bool:

@@ -144,7 +144,7 @@ TABLE = [
     ("ChangeBurnersFailure", ["at 19 s: flamer.burner[2] stuck for 3 commands"], REPAIRED),
     ("ChangeBurnersFailure", ["at 19 s: flamer.burner[2] stuck"], LOCKED_OUT),
     ("FlamerSilent", ["at 20 s: flamer silent for 5 s"], PASSED),
-    ("ChangeBurnersFailure", ["at 19 s: flamer.burner slow"], REPAIRED),
+    ("ChangeBurnersFailure", ["at 19 s: flamer.burner slow for 35 s"], REPAIRED),
     ("FlamerFrozen", ["at 20 s: flamer frozen for 5 s"], PASSED),
     ("FlamerFrozen", ["at 20 s: flamer wrong counter for 5 s"], PASSED),
     ("FlamerCommandsLost", ["at 20 s: mission silent for 3 s"], PASSED),
@@ -210,6 +210,29 @@ def test_a_locked_out_burner_or_start_can_be_reset_and_works_again(catalog: Cata
         assert mission.run().life(alarm)[-1] == "cleared"
         assert mission.tool.plant.flame
         assert mission.tool.hazards == []
+
+
+def test_nothing_is_lit_while_a_burner_stays_open_and_its_lock_out_can_not_be_reset(catalog: Catalog) -> None:
+    orders = ["at 2 s: flaming on", "at 20 s: burner high", "at 60 s: flaming off", "at 80 s: flaming on", "at 150 s: flaming on"]
+    mission = field(catalog, "at 59 s: flamer.burner[2] stuck for 70 s", orders=orders, duration="4 min").run(75)
+    assert mission.life("ChangeBurnersFailure") == LOCKED_OUT
+    mission.reset("ChangeBurnersFailure")
+    assert mission.run(128).life("ChangeBurnersFailure") == LOCKED_OUT, "refused while it is open"
+    assert not mission.tool.plant.flame
+    mission.run(140)
+    mission.reset("ChangeBurnersFailure")
+    assert mission.run().life("ChangeBurnersFailure")[-1] == "cleared"
+    assert mission.tool.plant.flame
+    assert mission.tool.hazards == []
+
+
+def test_a_flame_that_goes_out_is_not_lit_again_over_a_burner_that_stays_open(catalog: Catalog) -> None:
+    out = field(catalog, "at 29 s: flamer.burner[2] stuck", "at 30 s: flamer.pilot blown out",
+                orders=["at 2 s: flaming on", "at 20 s: burner high"], duration="4 min").run()
+    assert "raised" in out.life("ChangeBurnersFailure")
+    assert "repaired" not in out.life("PilotFlameOut")
+    assert not out.tool.plant.flame
+    assert out.tool.hazards == []
 
 
 @pytest.mark.parametrize("fault", [
