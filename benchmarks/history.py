@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import random
 import tempfile
 import time
 from collections.abc import Sequence
@@ -26,6 +27,18 @@ PAGE = page.PAGE.with_name("operation.md")
 UTC_NS = 1_746_093_600_000_000_000
 """Every sample has a label, as on a unit that knows the time."""
 BOUND_BYTES = 1 << 40
+JITTER_NS = 500_000
+"""By so much frames come late, as on a real bus: without it the ages of the values would be round, and take half the room."""
+
+
+class JitteryUnit(SimulatedUnit):
+    """Hears each frame a moment after it was sent."""
+
+    dice = random.Random(1)
+
+    def receive(self, t_ns: int, can_id: int, extended: bool, data: bytes) -> None:
+        """See `SimulatedUnit`."""
+        super().receive(t_ns + self.dice.randrange(JITTER_NS), can_id, extended, data)
 
 
 def mission(folder: Path) -> list[list[str]]:
@@ -49,8 +62,8 @@ def mission(folder: Path) -> list[list[str]]:
             lines += len(piece.lines)
             history.take([piece], 1)
             pack_s += time.process_time() - gathered
-    unit = SimulatedUnit(Supervisor(definitions.load(FILES), unit="tractor-7", start_ns=0, monitor_ns=MONITOR_NS,
-                                    utc_offset_ns=UTC_NS, utc_trusted=True), deliver)
+    unit = JitteryUnit(Supervisor(definitions.load(FILES), unit="tractor-7", start_ns=0, monitor_ns=MONITOR_NS,
+                                  utc_offset_ns=UTC_NS, utc_trusted=True), deliver)
     Simulation([*build(scenario).participants, unit]).run(scenario.duration_ns)
     if rest := gatherer.rest():
         history.take([rest], 1)
