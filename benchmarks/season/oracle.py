@@ -362,8 +362,9 @@ AIRBLAST_LOW = _symptom("AirblastTankLow", 12.0, lambda w, n: _tells(w) and w.ai
 AIRBLAST_TOLD_EMPTY = _symptom("AirblastTankCritical", 5.0, lambda w, n: _tells(w) and _airblast_told_percent(w) < 4)
 AIRBLAST_TOLD_LOW = _symptom("AirblastTankLow", 12.0, lambda w, n: _tells(w) and _airblast_told_percent(w) < 14)
 AIRBLAST_MISCOUNTS = _symptom("AirblastFrozen", 2.2, lambda w, n: _tells(w))
-NO_FLOW = _symptom("NoMainFlow", 3.6, lambda w, n: _tells(w) and w.airblast.works and w.airblast.plant.level_percent >= 6
+NO_FLOW = _symptom("NoMainFlow", 3.6, lambda w, n: _tells(w) and w.airblast.works and _airblast_told_percent(w) >= 6
                    and w.airblast.plant.flow_l_min < 1.8)
+"""A tank that is told to be empty, which AirblastTankCritical says, is reason enough for no flow."""
 WRONG_AIRBLAST = _symptom("AirblastStartStopFailure", 3.7, _wrong_airblast)
 AIRBLAST_EMERGENCY = _symptom("DeviceEmergency", 0.5, lambda w, n: w.airblast.talks and w.airblast.nmt_state != STOPPED_STATE
                               and bool(w.airblast.errors))
