@@ -122,6 +122,7 @@ class CanopenNode(Node):
     """Base of CANopen nodes. A subclass also names its EDS and node id; SENDS are its TPDOs in order, HEARS what it hears.
 
     `tick` is for the device's own work, `reboot` puts it back to where it stands after switching on. device: the package's node.
+    errors: those that last, by code and maker's bytes, and whether the emergency, which is sent once, has left the device.
     """
 
     EDS: ClassVar[str] = ""
@@ -130,7 +131,7 @@ class CanopenNode(Node):
 
     def __init__(self, name: str, codec: Codec, *, start_ns: int = 0):
         super().__init__(name, codec, start_ns=start_ns)
-        self.errors: dict[tuple[int, bytes], None] = {}
+        self.errors: dict[tuple[int, bytes], bool] = {}
         self.wire = Wire(start_ns)
         self.device = _local_node(self.EDS, self.NODE_ID)
         self.device.associate_network(self.wire)
@@ -192,11 +193,12 @@ class CanopenNode(Node):
         """An error has come: emergency, error register, history. Nothing when it is there already."""
         if (code, maker) in self.errors:
             return
-        self.errors[code, maker] = None
+        speaks = self.nmt_state not in (STOPPED, INITIALISING)
+        self.errors[code, maker] = speaks and self.talks
         self._set_register()
         history = self._history()
         self._set_history([code | int.from_bytes(maker[:2].ljust(2, b"\0"), "little") << 16, *history][:HISTORY])
-        if self.nmt_state not in (STOPPED, INITIALISING):
+        if speaks:
             self.device.emcy.send(code, self._register(), maker.ljust(5, b"\0"))
 
     def clear_error(self, code: int, maker: bytes = b"") -> None:

@@ -367,7 +367,7 @@ NO_FLOW = _symptom("NoMainFlow", 3.6, lambda w, n: _tells(w) and w.airblast.work
 """A tank that is told to be empty, which AirblastTankCritical says, is reason enough for no flow."""
 WRONG_AIRBLAST = _symptom("AirblastStartStopFailure", 3.7, _wrong_airblast)
 AIRBLAST_EMERGENCY = _symptom("DeviceEmergency", 0.5, lambda w, n: w.airblast.talks and w.airblast.nmt_state != STOPPED_STATE
-                              and bool(w.airblast.errors))
+                              and any(w.airblast.errors.values()))
 AIRBLAST_BABBLES = _symptom("DeviceEmergency", 0.5, lambda w, n: w.airblast.talks and w.airblast.nmt_state != STOPPED_STATE)
 AIRBLAST_NO_HEARTBEAT = _symptom("AirblastHeartbeatLost", 3.0, lambda w, n: _tells(w))
 AIRBLAST_STOPPED = _symptom("AirblastNotOperational", 3.0, lambda w, n: w.airblast.talks
@@ -407,7 +407,8 @@ SENSOR_DEAD = _symptom("Ultrasonic{n}NotWorking", 3.2, lambda w, n: _senses(w) a
 SENSOR_FROZEN = _symptom("UltrasonicFrozen", 8.0, lambda w, n: _senses(w) and w.ultrasonic.states[n - 1] == "Working"
                          and w.ultrasonic.sensors[n - 1].frozen != 0)
 ULTRASONIC_EMERGENCY = _symptom("DeviceEmergency", 0.5, lambda w, n: w.ultrasonic.talks and w.ultrasonic.nmt_state != STOPPED_STATE
-                                and bool(w.ultrasonic.errors))
+                                and any(w.ultrasonic.errors.values()))
+"""An emergency is sent once: one that came up while the device was silent, or stopped, nobody has heard."""
 ULTRASONIC_BABBLES = _symptom("DeviceEmergency", 0.5, lambda w, n: w.ultrasonic.talks
                               and w.ultrasonic.nmt_state != STOPPED_STATE)
 ULTRASONIC_NO_HEARTBEAT = _symptom("UltrasonicHeartbeatLost", 4.5, lambda w, n: _senses(w))
