@@ -24,6 +24,8 @@ from level1.io.error import OutsideError
 from level1.io.stamps import PLAUSIBLE_AGE_NS, Stamps
 
 BATCH = 64
+LOOKS = 3
+"""At the clocks before the first frame: it is unlikely to be interrupted in all of them."""
 MOST_BATCHES = 64
 """Batches of one `receive` at most, so that a flood can't hold the caller."""
 BUFFER_BYTES = 8 << 20
@@ -83,6 +85,8 @@ class Batches:
         self.last_ns: int | None = None
         self._sock = sock
         self._clock, self._wall, self._stamps = clock, wall, Stamps()
+        for _ in range(LOOKS):
+            self._offset_ns()
         for option in (_TIMESTAMPNS, _RXQ_OVFL):
             sock.setsockopt(socket.SOL_SOCKET, option, 1)
         # Frame and control data of each message lie side by side: one cut gives all that belongs together.
@@ -127,10 +131,14 @@ class Batches:
         if number not in (0, errno.EAGAIN, errno.EINTR):
             raise OSError(number, os.strerror(number))
 
+    def _offset_ns(self) -> tuple[int | None, int]:
+        """See `Stamps.offset_ns`; and what time it is."""
+        before_ns, wall_ns, now_ns = self._clock(), self._wall(), self._clock()
+        return self._stamps.offset_ns(before_ns, wall_ns, now_ns), now_ns
+
     def _append(self, count: int, shift: int, found: list[Row]) -> None:
         """Cut up what was fetched."""
-        before_ns, wall_ns, now_ns = self._clock(), self._wall(), self._clock()
-        offset = self._stamps.offset_ns(before_ns, wall_ns, now_ns)
+        offset, now_ns = self._offset_ns()
         last, = _LENGTH(self._header_view, (count - 1) * _HEADER + _LENGTH_AT)
         if last > _STAMP_SPACE:
             self.lost = int.from_bytes(self._view[(count - 1) * self._stride + self._drops_at:][:4], sys.byteorder)

@@ -18,11 +18,13 @@ class Stamps:
         """Wall clock minus monotonic clock; None: it has just jumped, and stamps are not to be believed. The wall clock showed
         `wall_ns` between `before_ns` and `now_ns`."""
         offset = wall_ns - now_ns
-        if now_ns - before_ns <= EVEN_NS:  # else the thread was interrupted between its looks at the clocks
+        if now_ns - before_ns <= EVEN_NS:
             if self._offset_ns is not None and abs(offset - self._offset_ns) > 2 * EVEN_NS:
                 # What was stamped before a jump may still be on its way.
                 self._even_since_ns = now_ns + PLAUSIBLE_AGE_NS
             self._offset_ns = offset
+        elif self._offset_ns is not None:
+            offset = self._offset_ns  # interrupted between its looks at the clocks, the thread has seen no better one
         return offset if now_ns >= self._even_since_ns else None
 
     def monotonic_ns(self, stamp_ns: int, before_ns: int, wall_ns: int, now_ns: int) -> int:
