@@ -21,6 +21,9 @@ from level1.io.stamps import PLAUSIBLE_AGE_NS
 from level1.supervisor import Supervisor
 
 MS = 1_000_000
+STAMPING_TRIES = 50
+"""The kernel begins to stamp in the background, some time after the first socket has asked for it (`net_enable_timestamp`); until
+then a frame gets the time at which it is read."""
 
 
 class Line:
@@ -61,15 +64,18 @@ def passes(filters: tuple[Filter, ...] | list[Filter], can_id: int) -> bool:
 class TestBatches:
     def test_frames_come_with_identifier_bus_data_and_the_time_of_their_coming(self, lines: list[Line]) -> None:
         lines.append(line := Line())
-        before_ns = time.monotonic_ns()
-        line.send(0x123, b"\1\2")
-        line.send(EXTENDED | 0x18FEF100, bytes(range(8)))
-        after_ns = time.monotonic_ns()
-        time.sleep(0.03)
-        frames = line.receive(2)
-        assert [(frame.key, frame.data) for frame in frames] == [
-            (frame_key(0x123, False, 2), b"\1\2"), (frame_key(0x18FEF100, True, 2), bytes(range(8)))]
-        assert all(before_ns - MS <= frame.t_ns <= after_ns + 5 * MS for frame in frames), "the kernel's time, not that of reading"
+        for _ in range(STAMPING_TRIES):
+            before_ns = time.monotonic_ns()
+            line.send(0x123, b"\1\2")
+            line.send(EXTENDED | 0x18FEF100, bytes(range(8)))
+            after_ns = time.monotonic_ns()
+            time.sleep(0.03)
+            frames = line.receive(2)
+            assert [(frame.key, frame.data) for frame in frames] == [
+                (frame_key(0x123, False, 2), b"\1\2"), (frame_key(0x18FEF100, True, 2), bytes(range(8)))]
+            if all(before_ns - MS <= frame.t_ns <= after_ns + 5 * MS for frame in frames):
+                return
+        pytest.fail("the time of reading, not the kernel's")
         assert line.batches.last_ns == frames[-1].t_ns
 
     def test_more_than_a_batch_comes_in_one_call_and_in_order(self, lines: list[Line]) -> None:
