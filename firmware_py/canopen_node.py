@@ -187,6 +187,11 @@ class CanopenNode(Node):
         """NMT state, as heartbeats say it."""
         return int(self.device.nmt._state)
 
+    @property
+    def beats(self) -> bool:
+        """Whether heartbeats are on. A reset, by NMT too, puts back what was switched off."""
+        return bool(self.device.sdo[HEARTBEAT_PRODUCER].raw)
+
     # --- errors -----------------------------------------------------------------------------------------------------------
 
     def raise_error(self, code: int, maker: bytes = b"") -> None:
@@ -317,7 +322,7 @@ class CanopenNode(Node):
             if self._babbles:
                 self._babbles = False
                 self.device.emcy.reset(self._register(), bytes(5))
-            if not self.device.sdo[HEARTBEAT_PRODUCER].raw:
+            if not self.beats:
                 self.device.data_store.pop(HEARTBEAT_PRODUCER)
                 self.device.nmt.start_heartbeat(self.device.sdo[HEARTBEAT_PRODUCER].raw)
 

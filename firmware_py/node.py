@@ -140,6 +140,11 @@ class Node:
         """Whether what leaves it is what it knows: not silent, not frozen, not off."""
         return self.powered and not self._silent and not self._frozen
 
+    @property
+    def is_believed(self) -> bool:
+        """Whether it talks, and nothing is wrong with the counter, or the checksum, of its status."""
+        return self.talks and not self._miscounts
+
     # --- faults -----------------------------------------------------------------------------------------------------------
 
     def inject(self, now_ns: int, statement: Statement) -> None:

@@ -141,6 +141,11 @@ class SprayerBoom(Node):
         return self._mode.position == "On"
 
     @property
+    def is_believed(self) -> bool:
+        """Its status has a checksum, too."""
+        return self.talks and not self._wrong
+
+    @property
     def set_points(self) -> tuple[float, float]:
         """Taken over: main flow in L/min, herbicide in mL/min, for all sections open."""
         return self._main_set.position, self._dis_set.position

@@ -139,7 +139,8 @@ FLAMER_MISSION: Mapping[str, Row] = {
 
 
 def _obeys(w: World) -> bool:
-    return w.sprayer.talks and w.sprayer.control == "Remote"
+    """What a status with a wrong counter or checksum says counts for nothing: SprayerDataCorrupt tells that."""
+    return w.sprayer.is_believed and w.sprayer.control == "Remote"
 
 
 def _share(w: World) -> float:
@@ -160,7 +161,7 @@ def _wrong_spraying(w: World, n: int) -> bool:
 
 def _wrong_main_flow(w: World, n: int) -> bool:
     target = w.sprayer.set_points[0] * _share(w)
-    return (w.sprayer.talks and w.sprayer.spraying and w.sprayer.plant.tank.level_l(w.now_ns) >= 12
+    return (w.sprayer.is_believed and w.sprayer.spraying and w.sprayer.plant.tank.level_l(w.now_ns) >= 12
             and abs(w.sprayer.plant.water.flow_l_min - target) > 0.4 + 0.2 * target)
 
 
@@ -191,14 +192,14 @@ def tank_differs_l(w: World) -> float:
 
 
 WRONG_SECTION = _symptom("Section{n}NotSet", 3.6, _wrong_section)
-STAYS_OPEN = _symptom("SectionStaysOpen", 3.6, lambda w, n: w.sprayer.talks and n in w.sprayer.locked
+STAYS_OPEN = _symptom("SectionStaysOpen", 3.6, lambda w, n: w.sprayer.is_believed and n in w.sprayer.locked
                       and w.sprayer.sections_open[n - 1])
 WRONG_SPRAYING = _symptom("SprayingStartStopFailure", 3.6, _wrong_spraying)
 MAIN_NOT_TAKEN = _symptom("SetMainFlowFailure", 2.7, _not_taken("SPRAYER_MAIN_CMD", "MainFlowWanted", 0))
 DIS_NOT_TAKEN = _symptom("SetDisFlowFailure", 4.7, _not_taken("SPRAYER_DIS_CMD", "DisFlowWanted", 1))
-WRONG_MAIN_FLOW = _symptom("MainFlowNotAdjusted", 5.7, _wrong_main_flow)
+WRONG_MAIN_FLOW = _symptom("MainFlowNotAdjusted", 7.7, _wrong_main_flow)
 WRONG_DIS_FLOW = _symptom("SetDisFlowFailure", 4.8, _wrong_dis_flow)
-LINE_BLOCKED = _symptom("HerbicideLineBlocked", 2.8, lambda w, n: w.sprayer.talks and w.sprayer.spraying
+LINE_BLOCKED = _symptom("HerbicideLineBlocked", 2.8, lambda w, n: w.sprayer.is_believed and w.sprayer.spraying
                         and w.sprayer.plant.herbicide.bar > 6.2)
 BOOM_BETWEEN = _symptom("BoomOpeningNotAdjusted", 18.7, _boom(("Open", "Opening"), ("Open", "Stopped"), ("Close", "Closing"),
                                                               ("Close", "Stopped")))
@@ -210,7 +211,7 @@ DIS_CRITICAL = _symptom("DisTankCritical", 7.0, lambda w, n: w.sprayer.talks and
 SPRAYER_QUIET = _symptom("SprayerSilent", 1.4, lambda w, n: not w.sprayer.sends)
 SPRAYER_STANDS = _symptom("SprayerFrozen", 2.0, lambda w, n: w.sprayer.sends and not w.sprayer.talks)
 SPRAYER_GARBLED = _symptom("SprayerDataCorrupt", 1.0, lambda w, n: w.sprayer.talks)
-SPRAYER_COMMANDS_LOST = _symptom("SprayerCommandsLost", 0.9, lambda w, n: w.sprayer.talks
+SPRAYER_COMMANDS_LOST = _symptom("SprayerCommandsLost", 0.9, lambda w, n: w.sprayer.is_believed
                                  and w.sprayer.control == "CommandsLost")
 SECTIONS = ("ChangeNozzlesFailure",)
 LINES = ("MainFlowNotAdjusted", "SetDisFlowFailure")
@@ -347,9 +348,14 @@ def _tells(w: World) -> bool:
     return w.airblast.talks and w.airblast.nmt_state == OPERATIONAL
 
 
+def _vouches(w: World) -> bool:
+    """What a status with a wrong counter says counts for nothing: AirblastFrozen tells that."""
+    return _tells(w) and w.airblast.is_believed
+
+
 def _wrong_airblast(w: World, n: int) -> bool:
     wanted = w.command("AIRBLAST_CMD").get("AirblastWanted")
-    return (_tells(w) and wanted is not None and (wanted == "On") != w.airblast.works
+    return (_vouches(w) and wanted is not None and (wanted == "On") != w.airblast.works
             and w.airblast.state not in ("TankEmpty", "CommandsLost"))
 
 
@@ -362,20 +368,20 @@ AIRBLAST_LOW = _symptom("AirblastTankLow", 12.0, lambda w, n: _tells(w) and w.ai
 AIRBLAST_TOLD_EMPTY = _symptom("AirblastTankCritical", 5.0, lambda w, n: _tells(w) and _airblast_told_percent(w) < 4)
 AIRBLAST_TOLD_LOW = _symptom("AirblastTankLow", 12.0, lambda w, n: _tells(w) and _airblast_told_percent(w) < 14)
 AIRBLAST_MISCOUNTS = _symptom("AirblastFrozen", 2.2, lambda w, n: _tells(w))
-NO_FLOW = _symptom("NoMainFlow", 3.6, lambda w, n: _tells(w) and w.airblast.works and _airblast_told_percent(w) >= 6
+NO_FLOW = _symptom("NoMainFlow", 3.6, lambda w, n: _vouches(w) and w.airblast.works and _airblast_told_percent(w) >= 6
                    and w.airblast.plant.flow_l_min < 1.8)
 """A tank that is told to be empty, which AirblastTankCritical says, is reason enough for no flow."""
 WRONG_AIRBLAST = _symptom("AirblastStartStopFailure", 3.7, _wrong_airblast)
 AIRBLAST_EMERGENCY = _symptom("DeviceEmergency", 0.5, lambda w, n: w.airblast.talks and w.airblast.nmt_state != STOPPED_STATE
                               and any(w.airblast.errors.values()))
 AIRBLAST_BABBLES = _symptom("DeviceEmergency", 0.5, lambda w, n: w.airblast.talks and w.airblast.nmt_state != STOPPED_STATE)
-AIRBLAST_NO_HEARTBEAT = _symptom("AirblastHeartbeatLost", 3.0, lambda w, n: _tells(w))
+AIRBLAST_NO_HEARTBEAT = _symptom("AirblastHeartbeatLost", 3.0, lambda w, n: _tells(w) and not w.airblast.beats)
 AIRBLAST_STOPPED = _symptom("AirblastNotOperational", 3.0, lambda w, n: w.airblast.talks
                             and w.airblast.nmt_state == STOPPED_STATE)
 AIRBLAST_QUIET = _symptom("AirblastSilent", 1.4, lambda w, n: not w.airblast.sends or w.airblast.nmt_state != OPERATIONAL)
 AIRBLAST_STANDS = _symptom("AirblastFrozen", 2.2, lambda w, n: w.airblast.sends and not w.airblast.talks
                            and w.airblast.nmt_state == OPERATIONAL)
-AIRBLAST_COMMANDS_LOST = _symptom("AirblastCommandsLost", 0.5, lambda w, n: _tells(w) and w.airblast.state == "CommandsLost")
+AIRBLAST_COMMANDS_LOST = _symptom("AirblastCommandsLost", 0.5, lambda w, n: _vouches(w) and w.airblast.state == "CommandsLost")
 DEVICE = ("DeviceSilent", "DeviceEmergency")
 AIRBLAST_ALL = (*DEVICE, "AirblastSilent", "AirblastRestarted", "AirblastNotOperational", "AirblastHeartbeatLost",
                 "AirblastCommandsLost", "AirblastStartStopFailure")
@@ -411,7 +417,7 @@ ULTRASONIC_EMERGENCY = _symptom("DeviceEmergency", 0.5, lambda w, n: w.ultrasoni
 """An emergency is sent once: one that came up while the device was silent, or stopped, nobody has heard."""
 ULTRASONIC_BABBLES = _symptom("DeviceEmergency", 0.5, lambda w, n: w.ultrasonic.talks
                               and w.ultrasonic.nmt_state != STOPPED_STATE)
-ULTRASONIC_NO_HEARTBEAT = _symptom("UltrasonicHeartbeatLost", 4.5, lambda w, n: _senses(w))
+ULTRASONIC_NO_HEARTBEAT = _symptom("UltrasonicHeartbeatLost", 4.5, lambda w, n: _senses(w) and not w.ultrasonic.beats)
 ULTRASONIC_STOPPED = _symptom("UltrasonicNotOperational", 4.0, lambda w, n: w.ultrasonic.talks
                               and w.ultrasonic.nmt_state == STOPPED_STATE)
 ULTRASONIC_QUIET = _symptom("UltrasonicSilent", 5.3, lambda w, n: not w.ultrasonic.sends)

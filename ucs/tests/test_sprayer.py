@@ -16,7 +16,7 @@ from firmware_py.participant import Happening
 from firmware_py.path_driver import PathDriver
 from firmware_py.scenario import build, parse
 from firmware_py.sprayer_boom import SprayerBoom
-from firmware_py.sprayer_plant import SECTIONS
+from firmware_py.sprayer_plant import HIGHEST_BAR, SECTIONS, WaterLine
 from firmware_py.virtual_bus import Simulation
 from level1.catalog import LOCKED_OUT, NORMAL, Catalog
 from level1.command import Order
@@ -182,6 +182,18 @@ def test_a_stuck_valve_is_told_in_the_mission_and_the_others_go_on(catalog: Cata
     used_l = stuck.sprayer.plant.tank.used_l
     stuck.run(300)
     assert stuck.sprayer.plant.tank.used_l > used_l + 0.3, "the next patches are sprayed all the same"
+
+
+def test_a_line_that_runs_down_with_all_sections_open_is_given_the_time(catalog: Catalog) -> None:
+    line, tick_s, t_s = WaterLine(0.02), 0.02, 0.0
+    line.regulator.position = HIGHEST_BAR
+    for _ in range(500):
+        line.advance(0, True, 20.0, SECTIONS, supply=True)
+    assert line.flow_l_min == pytest.approx(13.4, abs=0.1)
+    while line.flow_l_min > 0.3:
+        t_s += tick_s
+        line.advance(round(t_s * SECOND), True, 0.0, SECTIONS, supply=True)
+    assert 5 < t_s < catalog.alarms["MainFlowNotAdjusted"].on_delay_ns / SECOND - 0.5
 
 
 @pytest.mark.parametrize("seed", range(3))
