@@ -12,7 +12,7 @@ from random import Random
 import msgspec
 
 from benchmarks.season.episodes import Episodes
-from benchmarks.season.oracle import NATURAL, TABLE, Row, Symptom
+from benchmarks.season.oracle import LINGERS, NATURAL, TABLE, Row, Symptom
 from benchmarks.season.people import ROUND_NS, People
 from benchmarks.season.plan import Fault, Plan, S
 from benchmarks.season.world import World
@@ -294,7 +294,7 @@ class Day:
         lasting = {alarm for watched in (*self._active, *self._recent) for alarm in watched.explains}
         self._wrong += [f"STANDS {name} at the end of the day, without a reason" for name in self._episodes.standing
                         if name not in lasting and not self._left_behind(name) and name != OF[0]
-                        and not (name in NATURAL and NATURAL[name](self._world))]
+                        and not any(name in reasons and reasons[name](self._world) for reasons in (NATURAL, LINGERS))]
         for node, plant in ((name, one) for name, one in self._nodes.items() if hasattr(one, "hazards")):
             for hazard in plant.hazards:
                 dangers = [fault for fault in self._plan.faults if (fault.node, fault.name) in DANGEROUS

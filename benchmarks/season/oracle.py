@@ -495,3 +495,14 @@ NATURAL: Mapping[str, Callable[[World], bool]] = {
     "AirblastTankCritical": lambda w: w.airblast.plant.level_percent < 10,
 }
 """Alarm -> whether it is true now without any fault: wind, what was used up, what was ordered. It may also stand at the end."""
+
+LINGERS: Mapping[str, Callable[[World], bool]] = {
+    "BottleLow": lambda w: w.flamer.plant.bottle.level_percent < 20.5,
+    "BottleEmpty": lambda w: w.flamer.plant.bottle.bar < 1.55 or w.flamer.plant.bottle.level_percent < 5.5,
+    "MainTankCritical": lambda w: w.sprayer.plant.tank.level_l(w.now_ns) < 17,
+    "MainTankMismatch": lambda w: tank_differs_l(w) > 6,
+    "AirblastTankLow": lambda w: w.airblast.plant.level_percent < 20.8,
+    "AirblastTankCritical": lambda w: w.airblast.plant.level_percent < 10.8,
+}
+"""Alarm -> whether, once raised, it may stand at the end of the day: it clears at another limit (AlarmUntil) than it is raised
+at, and only when its sensor has been beyond that for a while, although the tank sloshes (1 L, or 0.4 %, either way)."""
