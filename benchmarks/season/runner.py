@@ -42,9 +42,10 @@ def run(jobs: Sequence[Job], processes: int) -> Iterator[DayResult]:
         for future in as_completed([executor.submit(work, job) for job in jobs]):
             yield future.result()
     except BaseException:
+        workers = list((executor._processes or {}).values())  # shutdown forgets them
         executor.shutdown(wait=False, cancel_futures=True)
-        for process in list((executor._processes or {}).values()):
-            process.terminate()
+        for worker in workers:
+            worker.terminate()
         raise
     executor.shutdown()
 
