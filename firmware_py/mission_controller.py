@@ -6,8 +6,8 @@ Theory of operation. It is told what to do (`flaming on`, `burner[2] high`) and 
     Lighting ──the safeguard gives up, or 4 s──▶ Failed ──5 s, nobody repairs──▶ Idle (order withdrawn)
     Working ──the tool left work mode by itself──▶ Purging        any ──flaming off ordered──▶ Idle
 
-Only Lighting and Working demand gas. It never lights without the purge, and never lights a flame again that went out in work:
-that is a repair.
+Only Lighting and Working demand gas. It never lights without the purge, nor by the word of a tool that has said nothing for three
+cycle times, and never lights a flame again that went out in work: that is a repair.
 
 The rule of the two senders: while an alarm in FLAMER_ALARMS reads Repairing or LockedOut, it sends no FLAMER_CMD, because
 level 1 does. When all read Normal or Active again it goes on: Working when the pilot flame burns, else from Purging. A lock-out
@@ -63,6 +63,8 @@ class MissionController(Node):
         self._levels = ["Off"] * BURNERS
         self._entered_ns = start_ns
         self._status: Mapping[str, Value] = {}
+        self._heard_ns = start_ns
+        self._stale_ns = 3 * codec.cycle_ns("FLAMER_STATUS")
         self._worked = False
         self._obedient = True
 
@@ -83,7 +85,7 @@ class MissionController(Node):
     def hear(self, t_ns: int, message: str, values: Mapping[str, Value]) -> None:
         """Status of the tool, or the alarms."""
         if message == "FLAMER_STATUS":
-            self._status = values
+            self._status, self._heard_ns = values, t_ns
             return
         holding = next((alarm for alarm, state in values.items() if state in ("Repairing", "LockedOut")), None)
         if "LockedOut" in values.values() and self._flaming:
@@ -112,7 +114,7 @@ class MissionController(Node):
         match self.state:
             case "Idle":
                 self._enter(t_ns, "Purging")
-            case "Purging" if status.get("Safeguard") == "Ready" and not burns:
+            case "Purging" if t_ns - self._heard_ns <= self._stale_ns and status.get("Safeguard") == "Ready" and not burns:
                 self._enter(t_ns, "Lighting")
                 self.tell(t_ns, "lights the pilot flame")
             case "Lighting" if burns:

@@ -72,6 +72,16 @@ def test_it_purges_a_tool_that_is_not_ready() -> None:
     assert mission.tool.hazards == []
 
 
+def test_it_does_not_light_by_the_last_word_of_a_tool_that_is_silent() -> None:
+    mission = Mission().run(0.5)
+    mission.tool.inject(mission.simulation.now_ns, Statement("", None, "silent"))
+    mission.run(0.4).order("flaming", "on").run(10)
+    assert mission.controller.state == "Purging" and not mission.tool.plant.flame
+    mission.tool.inject(mission.simulation.now_ns, Statement("", None, "works"))
+    assert mission.run(4).controller.state == "Working"
+    assert mission.tool.hazards == []
+
+
 def test_it_stops_when_ordered() -> None:
     mission = Mission().working().order("burner", "high").run(2).order("flaming", "off").run(2)
     assert mission.controller.state == "Idle"
