@@ -163,9 +163,10 @@ class AirblastSprayer(CanopenNode):
         if self._mode.position == "On" and not fresh and self._state == "Working":
             self._state = "CommandsLost"
             self.raise_error(COMMANDS_LOST)
-        elif self._state == "CommandsLost" and fresh:
-            self._state = "Idle"
+        elif fresh:  # whatever else has come meanwhile
             self.clear_error(COMMANDS_LOST)
+            if self._state == "CommandsLost":
+                self._state = "Idle"
         if self.plant.level_percent < EMPTY_PERCENT and self._state != "TankEmpty":
             self._state = "TankEmpty"
             self.raise_error(TANK_EMPTY)

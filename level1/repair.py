@@ -10,6 +10,10 @@ from that. When as many attempts as the budget allows have begun within its wind
 activation, locks the alarm out: safe state, held until a reset on board. Where the definition says so (RepairCounts Failed), an
 attempt that was good is given back to the budget when its alarm clears: what wind does again and again is reported, not locked.
 
+The pause (RepairPause) counts from the failure, whatever happens in it. Where a safe state is held through it, the episode lasts
+as long: the condition may be gone only because of that state. Where none is (AsCommanded, or nothing to give up), an alarm whose
+condition goes away meanwhile clears like any other; should it be raised again, the next attempt still waits for the pause's end.
+
 From the first attempt to the end of the episode the repair owns its command messages: it repeats them at their cycle time,
 and the alarm signal on the bus reads Repairing, upon which other programs stop sending them. One message serves one repair at a
 time; an alarm of higher priority takes it from one of lower. A lock-out goes on holding those that are sent at a cycle time.
@@ -59,7 +63,7 @@ class RepairMachine:
     """
 
     __slots__ = ("alarm", "attempt", "begun_ns", "definition", "due", "expects", "feedback", "good_ns", "holds", "host", "order",
-                 "phase", "position", "reported", "timers")
+                 "pause_end_ns", "phase", "position", "reported", "timers")
 
     def __init__(self, alarm: AlarmMachine, definition: Repair, host: Host, holds: Holds, timers: Timers,
                  expects: dict[int, Callable[[], int]], feedback: Callable[[], int]):
@@ -77,6 +81,7 @@ class RepairMachine:
         self.attempt = 0
         self.begun_ns: list[int] = []
         self.good_ns: list[int] = []
+        self.pause_end_ns = 0
         self.reported = False
 
     @property
@@ -111,10 +116,12 @@ class RepairMachine:
             if self.alarm.zone != Zone.RAISE:
                 self.due = FAR
                 self.phase = IDLE
+        elif self.phase == PAUSING:
+            self._end_if_over(t_ns)
         elif self.phase == IDLE and self.attempt and self.alarm.zone == Zone.RAISE and self.alarm.definition.on_delay_ns:
             self.phase = SETTLING
             self.timers.set(self, t_ns + self.alarm.definition.on_delay_ns)
-        elif self.phase != PAUSING:
+        else:
             self.consider(t_ns)
 
     def feedback_changed(self, t_ns: int, verdict: int) -> None:
@@ -213,6 +220,10 @@ class RepairMachine:
         if self.spent(t_ns):
             self.lock_out(t_ns, "as many attempts as the budget allows were made lately")
             return
+        if t_ns < self.pause_end_ns:
+            self.phase = PAUSING
+            self.timers.set(self, self.pause_end_ns)
+            return
         self.phase = WAITING
         if self.feedback() or self.host.forbidden(self.definition) or self.holds.claim(self, t_ns, self.messages):
             return
@@ -285,10 +296,18 @@ class RepairMachine:
         else:
             self.holds.restore(self, t_ns)
         self.phase = PAUSING
-        if self.definition.pause_ns:
-            self.timers.set(self, t_ns + self.definition.pause_ns)
-        else:
+        if not self.definition.pause_ns:
             self.expire(t_ns)
+            return
+        self.pause_end_ns = t_ns + self.definition.pause_ns
+        self.timers.set(self, self.pause_end_ns)
+        self._end_if_over(t_ns)
+
+    def _end_if_over(self, t_ns: int) -> None:
+        """A pause in which no safe state is held ends with the condition."""
+        safe = self.definition.safe_between and self.definition.give_up
+        if not safe and self.alarm.zone in (Zone.CLEAR, Zone.NEITHER):
+            self._end(t_ns)
 
     def _report_failure(self, t_ns: int, why: str) -> None:
         self.due = FAR

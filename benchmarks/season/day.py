@@ -42,6 +42,8 @@ DANGEROUS = (("flamer", "gas_valve stuck open"), ("flamer", "gas_valve leaks"), 
              ("flamer", "flame_sensor stuck off"), ("mission", "ignores repairs"))
 """Faults that are a danger of their own, whatever level 1 does."""
 DANGER_NS = 90 * S
+EVENING_NS = 60 * S
+"""Before the end nobody fills or orders anything any more: an alarm clears some seconds after its cause is gone."""
 MANY = 20
 
 
@@ -238,7 +240,8 @@ class Day:
             self._order(now_ns, "reset", name)
         if any(self._catalog.alarms[name].latch for name in self._episodes.standing):
             self._order(now_ns, "acknowledge", "")
-        self._people.look()
+        if now_ns < self._plan.length_ns - EVENING_NS:
+            self._people.look()
 
     def _order(self, now_ns: int, name: str, target: str) -> None:
         self._orders += 1

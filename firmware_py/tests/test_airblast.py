@@ -394,6 +394,16 @@ def test_commands_that_stop_close_the_main_valve_within_a_second() -> None:
     assert bench.last("AIRBLAST_STATUS")["Airblast"] == "On"
 
 
+def test_commands_that_come_back_clear_their_emergency_although_the_tank_ran_empty_meanwhile() -> None:
+    bench = Bench().spray()
+    bench.break_(bench.mission, "", "silent").run(1)
+    bench.break_(bench.sprayer, "tank", "empty").run(1)
+    bench.break_(bench.mission, "", "works").run(2)
+    assert [*bench.sprayer.errors] == [(0xFF10, b"")]
+    bench.break_(bench.sprayer, "tank", "filled").run(3)
+    assert bench.since(0x80 + SPRAYER, 0)[-1] == bytes(8)
+
+
 def test_a_sprayer_that_refuses_tries_again_on_retry_only_and_one_blocked_for_two_openings_is_freed_by_them() -> None:
     bench = Bench().run(1)
     bench.break_(bench.sprayer, "", "refuses start", commands=2).order("spraying", "on").run(5)

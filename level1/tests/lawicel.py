@@ -69,9 +69,13 @@ class Adapter:
         with self._lock:
             self.drains = False
             os.set_blocking(self._slave, False)
-            with suppress(BlockingIOError):
-                while True:
-                    os.write(self._slave, b"\r" * 512)
+            self._fill()
+
+    def _fill(self) -> None:
+        """Again and again while it hangs: the kernel passes what was written on to another buffer when it finds the time."""
+        with suppress(BlockingIOError):
+            while True:
+                os.write(self._slave, b"\r" * 512)
 
     def write(self, line: bytes) -> None:
         """Bytes to the unit; nothing while it is unplugged or its channel is closed."""
@@ -87,6 +91,8 @@ class Adapter:
     def _run(self) -> None:
         while not self._ended.wait(0.002):
             with self._lock:
+                if self._master >= 0 and not self.drains:
+                    self._fill()
                 if self._master >= 0 and self.drains and select.select([self._master], [], [], 0)[0]:
                     with suppress(OSError):
                         self._rest += os.read(self._master, 4096)

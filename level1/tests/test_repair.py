@@ -395,6 +395,39 @@ def test_a_harmless_repair_is_tried_again_from_what_was_commanded_before_it() ->
     assert {send.data[0] for send in sent if send.t_ns > lock_out * SECOND} == {0}
 
 
+def _paused_repair(safe_between: bool) -> tuple[Supervisor, list[Output]]:
+    """Wrong from 0 s, raised at 1 s, an attempt that fails at 2 s, a pause until 12 s."""
+    steps = (ResendStep("VALVES"), ExpectStep(compare("ACTUAL.Is", "==", 7), SECOND, "Is == 7"))
+    repair = Repair(steps, (SendStep("VALVES", {"Set": 0}),), attempts=3, safe_between=safe_between, pause_ns=10 * SECOND)
+    wrong = alarm("Wrong", compare("ACTUAL.Is", "!=", 7), on_delay_ns=SECOND, off_delay_ns=SECOND, repair=repair)
+    target = supervisor([VALVES, ACTUAL], [wrong])
+    return target, list(_actual(target, 0, 25, 3))
+
+
+def _actual(target: Supervisor, begin: int, end: int, value: int) -> Iterable[Output]:
+    for n in range(begin, end):
+        yield from target.receive(Frame(n * 100 * MS, frame_key(0x401, False), b"\x07" + bytes(7)))
+        yield from target.receive(Frame(n * 100 * MS, frame_key(0x402, False), bytes([value]) + bytes(7)))
+
+
+def test_an_alarm_whose_cause_goes_away_in_a_pause_clears_and_the_pause_still_counts() -> None:
+    """A clock that is right again a minute after an attempt to set it does not stand as wrong for the other four."""
+    target, outputs = _paused_repair(safe_between=False)
+    outputs += _actual(target, 25, 50, 7)
+    outputs += _actual(target, 50, 130, 3)
+    assert [(t, word) for t, _, word in events(outputs)] == [
+        (1, "raised"), (1, "repair_started"), (2, "repair_failed"), (3.5, "cleared"), (6, "raised"), (12, "repair_started")]
+
+
+def test_a_safe_state_is_held_through_the_pause_although_the_condition_is_gone() -> None:
+    """It may be gone only because of the safe state."""
+    target, outputs = _paused_repair(safe_between=True)
+    outputs += _actual(target, 25, 130, 7)
+    assert [(t, word) for t, _, word in events(outputs)] == [
+        (1, "raised"), (1, "repair_started"), (2, "repair_failed"), (12, "cleared")]
+    assert {send.data[0] for send in sends(outputs, "VALVES") if send.t_ns > 2 * SECOND} == {0}
+
+
 def test_a_flame_lost_again_before_the_alarm_has_cleared_must_be_lost_for_the_on_delay_again() -> None:
     tool = Flamer(supervisor([STATUS, COMMAND], [pilot_flame_out(off_delay_ns=5 * SECOND)]))
     tool.run(1)
