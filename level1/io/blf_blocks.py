@@ -17,10 +17,10 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from level1.block import HEAD_BYTES, Block, Ints
+from level1.block import HEAD_BYTES, Ints
 from level1.frame import BUS_SHIFT, ERROR, EXTENDED, REMOTE
 from level1.io.message import CLASSIC_BYTES, FD_BYTES
-from level1.io.rows import HEAD_MASKS, MOST_TALKERS, Numbers, Rows
+from level1.io.rows import HEAD_MASKS, BlockReader, Numbers, Rows
 
 SIGNATURE = b"LOGG"
 MESSAGE, CONTAINER, ERROR_FRAME, MESSAGE_2, FD_MESSAGE, FD_MESSAGE_64 = 1, 10, 73, 86, 100, 101
@@ -46,12 +46,14 @@ _OBJECT_BYTES = 160
 """Bytes looked at of an object: the longest that is read, a CAN FD frame, has less."""
 
 
-class BlfBlocks:
+class BlfBlocks(BlockReader):
     """Reads a BLF file in blocks.
 
     file: where to read, at its beginning. bus(channel): index of a channel's bus, asked in the order of appearance.
     skip(reason): told of every frame or container that can't be read, in order.
     """
+
+    PIECE_ROWS = BATCH_BYTES // 32
 
     def __init__(self, file: BinaryIO, bus: Callable[[str], int], skip: Callable[[str], None]):
         self._file = file
@@ -61,37 +63,19 @@ class BlfBlocks:
         self._start_ns = 0
         self._read = self._left_out = 0
         self._tail = b""
-        self._rows = Rows(0)
-        self._forget()
+        super().__init__()
 
     def _forget(self) -> None:
-        """Begin a block: no talker is known."""
-        self._talkers: dict[int, int] = {}
+        super()._forget()
         self._numbers = Numbers(self._talker)
 
-    def blocks(self, rows: int) -> Iterator[Block]:
-        """The frames, so many or somewhat more a block; each block is good until the next is asked for.
+    def _pieces(self) -> Iterator[None]:
+        for data in self._batches():
+            self._take(data)
+            yield
 
-        Raises what reading the file raises, after the frames before it.
-        """
-        self._rows = Rows(rows + BATCH_BYTES // 32)
-        try:
-            for data in self._batches():
-                self._take(data)
-                if self._rows.count >= rows or len(self._talkers) >= MOST_TALKERS:
-                    yield self._block()
-        except (EOFError, OSError, zlib.error):
-            if self._rows.count:
-                yield self._block()
-            raise
-        if self._rows.count:
-            yield self._block()
-
-    def _block(self) -> Block:
-        keys = [word & 0xFFFF_FFFF | self._buses[word >> 32 & 0xFFFF] << BUS_SHIFT for word in self._talkers]
-        if len(keys) >= MOST_TALKERS:
-            self._forget()
-        return self._rows.block(keys)
+    def _keys(self) -> list[int]:
+        return [word & 0xFFFF_FFFF | self._buses[word >> 32 & 0xFFFF] << BUS_SHIFT for word in self._talkers]
 
     def _talker(self, word: int) -> int:
         return self._talkers.setdefault(word, len(self._talkers))

@@ -17,10 +17,10 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from level1.block import HEAD_BYTES, Block, Ints, Words
+from level1.block import HEAD_BYTES, Ints, Words
 from level1.frame import BUS_SHIFT
 from level1.io.message import FD_BYTES
-from level1.io.rows import MOST_TALKERS, Numbers, Rows
+from level1.io.rows import BlockReader, Numbers, Rows
 
 LONGEST = 512
 """Longer lines are left to the scalar reader; a CAN FD frame of 64 bytes takes some 350 characters in ASC at most."""
@@ -169,12 +169,14 @@ def decimal(words: Words) -> tuple[Words, Words]:
     return words, strange
 
 
-class LineBlocks:
+class LineBlocks(BlockReader):
     """Reads text in blocks; what a line means is a subclass's to say.
 
     file: where to read. bus(channel): index of a channel's bus, asked in the order of appearance. skip(reason): told of every line
     that can't be read, in order. lines: how many stand before.
     """
+
+    PIECE_ROWS = CHUNK_BYTES // SHORT_LINE
 
     def __init__(self, file: BinaryIO, bus: Callable[[str], int], skip: Callable[[str], None], lines: int = 0):
         self._file = file
@@ -183,8 +185,7 @@ class LineBlocks:
         self._shapes: dict[int, list[Shape]] = {}
         self._buses: dict[bytes, int] = {}
         self._lines = lines
-        self._rows = Rows(0)
-        self._forget()
+        super().__init__()
 
     # --- what a subclass says ---------------------------------------------------------------------------------------------
 
@@ -210,35 +211,14 @@ class LineBlocks:
     # --- blocks -----------------------------------------------------------------------------------------------------------
 
     def _forget(self) -> None:
-        """Begin a block: no talker is known."""
-        self._talkers: dict[tuple[bytes, int], int] = {}
+        super()._forget()
         self._names: dict[tuple[bytes, int], Numbers] = {}
 
-    def blocks(self, rows: int) -> Iterator[Block]:
-        """The frames, so many or somewhat more a block; each block is good until the next is asked for.
+    def _keys(self) -> list[int]:
+        return [key | self._buses[channel] << BUS_SHIFT for channel, key in self._talkers]
 
-        Raises what reading the file raises, after the frames before it.
-        """
-        self._rows = Rows(rows + CHUNK_BYTES // SHORT_LINE)
-        try:
-            for _ in self._chunks():
-                if self._rows.count >= rows or len(self._talkers) >= MOST_TALKERS:
-                    yield self._block()
-        except (EOFError, OSError, zlib.error):
-            if self._rows.count:
-                yield self._block()
-            raise
-        if self._rows.count:
-            yield self._block()
-
-    def _block(self) -> Block:
-        keys = [key | self._buses[channel] << BUS_SHIFT for channel, key in self._talkers]
-        if len(keys) >= MOST_TALKERS:
-            self._forget()
-        return self._rows.block(keys)
-
-    def _chunks(self) -> Iterator[None]:
-        """Take the frames of the text in pieces of whole lines, and stop after each."""
+    def _pieces(self) -> Iterator[None]:
+        """Chunks of whole lines."""
         text = bytearray(CHUNK_BYTES + 2 * width_of(LONGEST))
         view, buffer = memoryview(text), np.frombuffer(text, np.uint8)
         filled, error, got = 0, None, 1

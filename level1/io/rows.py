@@ -1,8 +1,9 @@
 """What the readers of blocks have in common: rows that become a block, and numbers for identifiers."""
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -97,6 +98,56 @@ class Rows:
         block = Block(self._t_ns[:count], self._talker[:count], keys, self._length[:count], self._head[:count], wide_rows[order],
                       wide[order])
         return block
+
+
+class BlockReader:
+    """Gathers the frames of a recording into blocks; how they are found is a subclass's to say.
+
+    PIECE_ROWS: rows that a piece brings at most, or nearly. _rows: where the frames go. _talkers: the talkers of this block by
+    whatever names them, in the order of their numbers.
+    """
+
+    PIECE_ROWS: ClassVar[int]
+
+    def __init__(self) -> None:
+        self._talkers: dict[Any, int] = {}
+        self._rows = Rows(0)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Begin a block: no talker is known."""
+        self._talkers = {}
+
+    def _pieces(self) -> Iterator[None]:
+        """Add the frames piece by piece, and stop after each."""
+        raise NotImplementedError
+
+    def _keys(self) -> list[int]:
+        """`Frame.key` of each talker."""
+        raise NotImplementedError
+
+    def blocks(self, rows: int) -> Iterator[Block]:
+        """The frames, so many or somewhat more a block; each block is good until the next is asked for.
+
+        Raises what reading the file raises, after the frames before it.
+        """
+        self._rows = Rows(rows + self.PIECE_ROWS)
+        try:
+            for _ in self._pieces():
+                if self._rows.count >= rows or len(self._talkers) >= MOST_TALKERS:
+                    yield self._block()
+        except (EOFError, OSError, zlib.error):
+            if self._rows.count:
+                yield self._block()
+            raise
+        if self._rows.count:
+            yield self._block()
+
+    def _block(self) -> Block:
+        keys = self._keys()
+        if len(keys) >= MOST_TALKERS:
+            self._forget()
+        return self._rows.block(keys)
 
 
 HEAD_MASKS = np.array([(1 << 8 * size) - 1 for size in range(HEAD_BYTES + 1)], np.uint64)

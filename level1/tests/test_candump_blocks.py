@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from level1.frame import Frame
-from level1.io import candump_blocks, line_blocks
+from level1.io import candump_blocks, line_blocks, rows
 from level1.io.replay import Log, LogError
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
@@ -114,7 +114,7 @@ def test_blocks_are_of_the_size_asked_for_or_a_chunk_more(tmp_path: Path, monkey
 
 def test_random_identifiers_end_a_block_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(line_blocks, "CHUNK_BYTES", 4000)
-    monkeypatch.setattr(line_blocks, "MOST_TALKERS", 100)
+    monkeypatch.setattr(rows, "MOST_TALKERS", 100)
     text = "".join(f"(1.{n:06d}) can0 {n * 7919:08X}#11\n" for n in range(3000))
     log, frames = both(tmp_path, text.encode())
     assert len(frames) == 3000
