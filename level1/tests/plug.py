@@ -25,6 +25,7 @@ class Plug:
     def __init__(self, path: Path):
         self.path = path
         self._master = self._slave = -1
+        self._rest = b""
         self.plug()
 
     def plug(self) -> None:
@@ -32,6 +33,7 @@ class Plug:
         self._master, self._slave = pty.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
+        self._rest = b""
         self.path.unlink(missing_ok=True)
         self.path.symlink_to(os.ttyname(self._slave))
 
@@ -46,6 +48,8 @@ class Plug:
         self.send(b"".join(map(sentence, bodies)))
 
     def send(self, data: bytes) -> None:
-        """Send bytes; what nobody reads is lost."""
+        """Send bytes; what nobody reads is lost, but nothing of which the line has taken a part."""
         with suppress(BlockingIOError):
-            os.write(self._master, data)
+            self._rest = self._rest[os.write(self._master, self._rest):]
+            if not self._rest:
+                self._rest = data[os.write(self._master, data):]

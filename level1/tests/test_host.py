@@ -23,7 +23,7 @@ from level1.io.host import (
     temperatures,
 )
 
-WAIT_S = 10.0
+WAIT_S = 30.0
 
 
 @pytest.fixture

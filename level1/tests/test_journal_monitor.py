@@ -13,7 +13,7 @@ from level1.event import Monitor, seconds
 from level1.io import journal_monitor
 from level1.io.journal import Journal, JournalError, read_events
 from level1.io.journal_monitor import PIECES, HistoryReader
-from level1.tests.test_journal import VERSION_1, an_event, events, eventually, on_small_disk, write_lock
+from level1.tests.test_journal import PATIENT_NS, VERSION_1, an_event, events, eventually, on_small_disk, write_lock
 
 MB = 1_000_000
 BEGIN = datetime(2025, 5, 1, 10, tzinfo=UTC)
@@ -58,7 +58,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.mark.fault("power cut", "of the monitoring history, written a minute at a time, the last minute is lost")
 def test_a_minute_is_one_batch_and_until_it_is_over_nothing_is_written(path: Path) -> None:
-    with Journal(path, "tractor-7", monitor_bytes=MB) as journal:
+    with Journal(path, "tractor-7", patience_ns=PATIENT_NS, monitor_bytes=MB) as journal:
         record(journal, samples(0, 60))
         assert journal.append(events(1), b""), "the thread has come by"
         assert rows(path) == 0
@@ -168,12 +168,12 @@ def test_the_memory_of_a_history_that_waits_is_bounded(path: Path, monkeypatch: 
             record(journal, samples(0, 100))
             assert len(journal._pieces) <= PIECES
         eventually(lambda: journal.fault is None)
-        assert journal.append(events(1, first=2), b"")
+        journal.append(events(1, first=2), b"")
     assert read_events(path) == events(2)
 
 
 def test_an_event_does_not_wait_for_a_history_that_can_not_be_written(path: Path) -> None:
-    with Journal(path, "tractor-7", monitor_bytes=MB) as journal:
+    with Journal(path, "tractor-7", patience_ns=PATIENT_NS, monitor_bytes=MB) as journal:
         path.with_name("journal.db.monitor").mkdir()
         record(journal, samples(0, 61))
         eventually(lambda: journal.unrecorded)
@@ -185,10 +185,10 @@ FULL_DISK = """
     import sys
     from pathlib import Path
     from level1.io.journal import Journal, read_events
-    from level1.tests.test_journal import an_event, eventually
+    from level1.tests.test_journal import PATIENT_NS, an_event, eventually
     from level1.tests.test_journal_monitor import MB, record, rows, samples
     folder = Path(sys.argv[1])
-    with Journal(folder / "journal.db", "tractor-7", monitor_bytes=2 * MB) as journal:
+    with Journal(folder / "journal.db", "tractor-7", patience_ns=PATIENT_NS, monitor_bytes=2 * MB) as journal:
         for minute in range(5):
             record(journal, samples(60.25 * minute, 60.25 * (minute + 1), noise=100))
             eventually(lambda: rows(folder / "journal.db") > minute)
@@ -226,7 +226,7 @@ def test_on_a_full_disk_the_history_goes_first_and_is_never_written_from_the_res
 
 
 def test_events_and_samples_that_come_together_are_all_kept(path: Path) -> None:
-    with Journal(path, "tractor-7", monitor_bytes=10 * MB) as journal:
+    with Journal(path, "tractor-7", patience_ns=PATIENT_NS, monitor_bytes=10 * MB) as journal:
         for minute in range(10):
             record(journal, samples(60.25 * minute, 60.25 * (minute + 1)))
             assert journal.append([an_event(minute + 1)], b"")

@@ -23,7 +23,7 @@ from level1.io.replay import Log
 
 MB = 1 << 20
 S, MS = 1_000_000_000, 1_000_000
-WAIT_S = 20.0
+WAIT_S = 30.0
 START_NS, UTC_NS = 5_000 * S, 1_700_000_000 * S
 
 
@@ -171,7 +171,7 @@ def test_a_disk_that_takes_no_more_is_told_and_recording_goes_on_when_it_does(be
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (one.size() + 10_000, hard))
         one.recorder.record(noise(10_000, 1))
-        one.until(lambda: one.recorder.fault)
+        one.until(lambda: one.recorder.fault and one.drained())
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     dropped = one.recorder.dropped

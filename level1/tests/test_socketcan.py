@@ -73,10 +73,10 @@ class TestBatches:
             frames = line.receive(2)
             assert [(frame.key, frame.data) for frame in frames] == [
                 (frame_key(0x123, False, 2), b"\1\2"), (frame_key(0x18FEF100, True, 2), bytes(range(8)))]
+            assert line.batches.last_ns == frames[-1].t_ns
             if all(before_ns - MS <= frame.t_ns <= after_ns + 5 * MS for frame in frames):
                 return
         pytest.fail("the time of reading, not the kernel's")
-        assert line.batches.last_ns == frames[-1].t_ns
 
     def test_more_than_a_batch_comes_in_one_call_and_in_order(self, lines: list[Line]) -> None:
         lines.append(line := Line())
