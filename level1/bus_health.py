@@ -51,6 +51,26 @@ class Report(NamedTuple):
     text: str
 
 
+class Outages:
+    """How long each bus was away, by the times that its events bear: the figure and they can't differ, however late the report
+    of a starved thread was heard."""
+
+    def __init__(self) -> None:
+        self._since_ns: dict[str, int] = {}
+
+    def measured(self, report: Report) -> Report:
+        """The same report, with `AwaySeconds` (to the millisecond) where a bus is back. Its t_ns: that of the event."""
+        if report.alarm != DOWN:
+            return report
+        if report.present:
+            self._since_ns.setdefault(report.key, report.t_ns)
+            return report
+        since_ns = self._since_ns.pop(report.key, None)
+        if since_ns is None:  # lost in another boot, whose time line is over
+            return report
+        return report._replace(detail={**report.detail, "AwaySeconds": round((report.t_ns - since_ns) / 1e9, 3)})
+
+
 class Traffic(NamedTuple):
     """What was counted in a window. ids: frames by identifier with flags, among those received here; lost: dropped on the way
     to here; unsent: frames that could not be sent, by message; sent: the others. span_ns: time from the first frame to the last."""
@@ -67,15 +87,17 @@ def _no_cycle(_: int) -> int | None:
 
 
 class BusHealth:
-    """name, channel: of the bus. bitrate: bit/s, None: not known. cycle_of: nominal cycle of an identifier with flags, ns."""
+    """name, channel: of the bus. bitrate: bit/s, None: not known. cycle_of: nominal cycle of an identifier with flags, ns.
+
+    The times of its reports never run backwards, though an error frame may be heard after the end of a window that it came in.
+    """
 
     def __init__(self, name: str, channel: str, bitrate: int | None = None):
         self.name, self.channel = name, channel
         self.cycle_of: Callable[[int], int | None] = _no_cycle
         self.most_a_second = (bitrate or DEFAULT_BITRATE) // (2 * BITS_A_FRAME)
-        self._down_ns: int | None = None
         self._state = "BusActive"
-        self._off_ns = 0
+        self._off_ns = self._told_ns = 0
         self._errors = 0
         self._quiet: dict[tuple[str, str], int] = {}
         self._detail: dict[tuple[str, str], dict[str, Any]] = {}
@@ -84,7 +106,11 @@ class BusHealth:
     @property
     def state(self) -> str:
         """A word of `health.BUS_STATES`."""
-        return "BusDown" if self._down_ns is not None else self._state
+        return "BusDown" if self._is_down else self._state
+
+    @property
+    def _is_down(self) -> bool:
+        return (DOWN, self.name) in self._detail
 
     @property
     def babbles(self) -> bool:
@@ -95,21 +121,14 @@ class BusHealth:
 
     def down(self, t_ns: int, reason: str) -> list[Report]:
         """The interface is lost."""
-        if self._down_ns is not None:
+        if self._is_down:
             return []
-        self._down_ns = t_ns
         return [self._there(t_ns, DOWN, "", {"Channel": self.channel, "Reason": reason}, f"bus {self.name} is lost: {reason}")]
 
     def up(self, t_ns: int) -> list[Report]:
         """The interface is open again; its controller begins anew."""
         self._state, self._errors = "BusActive", 0
-        reports = [self._over(t_ns, alarm, key) for alarm, key in list(self._detail) if alarm in (OFF, ERRORS)]
-        if self._down_ns is not None:
-            away = round((t_ns - self._down_ns) / 1e9, 3)
-            self._down_ns = None
-            self._detail[DOWN, self.name] = {**self._detail[DOWN, self.name], "AwaySeconds": away}
-            reports.append(self._over(t_ns, DOWN, self.name))
-        return reports
+        return [self._over(t_ns, alarm, key) for alarm, key in list(self._detail) if alarm in (OFF, ERRORS, DOWN)]
 
     # --- the controller -----------------------------------------------------------------------------------------------
 
@@ -189,7 +208,7 @@ class BusHealth:
             yield from self._quieter(t_ns, LOST, self.name)
 
     def _judge_unsent(self, t_ns: int, unsent: Mapping[str, int], sent: int) -> Iterable[Report]:
-        silenced = DOWN if self._down_ns is not None else OFF if self._state == "BusOff" else None
+        silenced = DOWN if self._is_down else OFF if self._state == "BusOff" else None
         if silenced is not None:  # one cause, one alarm: what could not be sent stands in its values
             if unsent:
                 detail = {name: value for name, value in self._detail[silenced, self.name].items() if name != "Bus"}
@@ -210,7 +229,7 @@ class BusHealth:
         self._quiet[alarm, key] = 0
         self._text[alarm, key] = text
         self._detail[alarm, key] = {"Bus": self.name} | detail
-        return Report(t_ns, alarm, key, True, self._detail[alarm, key], text)
+        return Report(self._rising(t_ns), alarm, key, True, self._detail[alarm, key], text)
 
     def _quieter(self, t_ns: int, alarm: str, key: str) -> Iterable[Report]:
         if (alarm, key) not in self._detail:
@@ -221,4 +240,8 @@ class BusHealth:
 
     def _over(self, t_ns: int, alarm: str, key: str) -> Report:
         del self._quiet[alarm, key]
-        return Report(t_ns, alarm, key, False, self._detail.pop((alarm, key)), self._text.pop((alarm, key)))
+        return Report(self._rising(t_ns), alarm, key, False, self._detail.pop((alarm, key)), self._text.pop((alarm, key)))
+
+    def _rising(self, t_ns: int) -> int:
+        self._told_ns = max(t_ns, self._told_ns)
+        return self._told_ns

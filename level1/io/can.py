@@ -308,12 +308,12 @@ class Port:
             self._inbox.watch(descriptor)
 
     def _lose(self, error: Exception) -> None:
-        self._close()
         if self._lost_ns is None:
             self._lost_ns = self._clock()
             self.counters["lost"] += 1
             self._report(self.health.down(self._lost_ns, reason(error)))
             self._inbox.notice(f"bus {self.settings.name}: lost ({reason(error)}); trying again")
+        self._close()  # only now: a driver may take long over it
 
     def _find(self) -> None:
         now_ns = self._clock()

@@ -1,11 +1,11 @@
 """The live loop: the one thread that owns the supervisor of a unit.
 
-It waits for frames, orders or the next deadline; hands frames over in batches, in the order of their stamps; and brings what
-comes out to where it belongs: **events into the journal first, on the disk**, then frames to the buses, then results and
-monitoring messages to the link upward. On a busy bus waking up costs more than all the rest: while turns of the loop follow
-each other within `BUSY_NS` there is at least `NAP_NS` between two, in which frames gather; a frame on a quiet bus is looked at at
-once. What a turn does without a reason to is paid a thousand times a second: it looks at the inbox, and asks for readings, only
-when the bell has rung.
+It waits for frames, orders or the next deadline; hands frames over in batches, and what the buses' threads report among them, in
+the order of the stamps; and brings what comes out to where it belongs: **events into the journal first, on the disk**, then
+frames to the buses, then results and monitoring messages to the link upward. On a busy bus waking up costs more than all the
+rest: while turns of the loop follow each other within `BUSY_NS` there is at least `NAP_NS` between two, in which frames gather; a
+frame on a quiet bus is looked at at once. What a turn does without a reason to is paid a thousand times a second: it looks at the
+inbox, and asks for readings, only when the bell has rung.
 
 Time is the monotonic clock; UTC is a label, measured anew all the time, because the wall clock of a tractor jumps.
 """
@@ -21,7 +21,7 @@ from typing import Protocol
 import msgspec
 
 from level1 import bus_health, health
-from level1.bus_health import Report
+from level1.bus_health import Outages, Report
 from level1.command import Order
 from level1.event import Commanded, Event, Monitor, Output, Result, Send, SentFrame, seconds
 from level1.frame import BUS_SHIFT, EXTENDED, Row
@@ -147,6 +147,7 @@ class Live:
         self._missing_ns: int | None = None
         self._addresses: dict[int, int] = {}
         self._begun = False
+        self._outages = Outages()
         for port in ports:
             self._listen(port)
 
@@ -184,8 +185,10 @@ class Live:
             oldest_ns = frames[0][0]
         if now_ns - oldest_ns > self._lateness_ns:
             self._lateness_ns = now_ns - oldest_ns
-        readings = self._hear(load) if load is not NOTHING else ()
-        outputs = self._feed(frames, readings) if frames or readings else []
+        beside = self._hear(load, now_ns) if load is not NOTHING or self._missing else ()
+        outputs: list[Output] = [] if self._begun else self._begin()
+        if frames or beside:
+            outputs += self._feed(frames, beside)
         served_ns = now_ns - LAG_NS
         if served_ns < supervisor.now_ns:
             served_ns = supervisor.now_ns
@@ -197,8 +200,6 @@ class Live:
         deadline = supervisor.next_deadline()
         if deadline is not None and deadline <= self._served_ns:
             outputs.extend(supervisor.tick(self._served_ns))
-        if load is not NOTHING or self._missing or not self._begun:
-            outputs.extend(self._tell(load.reports, load.dropped, now_ns))
         if outputs or self._retry_ns is not None or now_ns - self._delivered_ns >= QUIET_NS:
             self._delivered_ns = now_ns
             self._deliver(outputs, commands)
@@ -232,41 +233,41 @@ class Live:
         frames.sort(key=_stamp)
         return frames
 
-    def _hear(self, load: Load) -> list[Reading]:
-        """The bell has rung: tell what is to be told at once, and take what the UCS says of itself."""
+    def _hear(self, load: Load, now_ns: int) -> list[Reading | Report]:
+        """The bell has rung: tell what is to be told at once, and take what the UCS says of itself and what befell its buses, in
+        the order of the stamps."""
         for text in load.notices:
             self._notice(text)
         if load.dropped:
             self.dropped += load.dropped
             self._notice(f"{load.dropped} frames dropped, the oldest first: supervision can't keep up")
-        return self._readings()
+        beside: list[Reading | Report] = [*self._readings(), *load.reports, *self._drops(load.dropped, now_ns)]
+        beside.sort(key=_stamp)
+        return beside
 
     # --- the health of the buses --------------------------------------------------------------------------------------
 
-    def _tell(self, reports: Sequence[Report], dropped: int, now_ns: int) -> Sequence[Output]:
-        """Causes of alarms that no condition raises."""
-        reports = [*reports, *self._drops(dropped, now_ns)]
-        if self._begun and not reports:
-            return ()
-        outputs: list[Output] = []
-        if not self._begun:
-            outputs += self.supervisor.tick(self._served_ns)
-            reports = [*self._old_causes(), *reports]
-            self._begun = True
-        for report in reports:
-            t_ns = max(min(report.t_ns, now_ns), self.supervisor.now_ns)
-            outputs += self.supervisor.tick(t_ns)
-            if report.present or report.key in self.supervisor.causes(report.alarm):
-                self.supervisor.report(t_ns, report.alarm, report.key, True, report.detail, report.text)
-            self.supervisor.report(t_ns, report.alarm, report.key, report.present, report.detail, report.text)
-            self.supervisor.board.settle(t_ns)
-        return outputs + list(self.supervisor.tick(self.supervisor.now_ns))
+    def _begin(self) -> list[Output]:
+        """The first turn: what the last boot left of the buses is over, unless it is reported again."""
+        self._begun = True
+        supervisor = self.supervisor
+        outputs = list(supervisor.tick(max(self._served_ns, supervisor.now_ns)))
+        for alarm in bus_health.ALARMS:
+            for key, detail in supervisor.causes(alarm).items():
+                outputs += self._tell(Report(supervisor.now_ns, alarm, key, False, detail, ""))
+        return outputs
 
-    def _old_causes(self) -> list[Report]:
-        """What the last boot left: over, unless it is reported again."""
-        now_ns = self.supervisor.now_ns
-        return [Report(now_ns, alarm, key, False, detail, "") for alarm in bus_health.ALARMS
-                for key, detail in self.supervisor.causes(alarm).items()]
+    def _tell(self, report: Report) -> Sequence[Output]:
+        """A cause of an alarm that no condition raises, at its time, or, heard late, at the time that supervision has come to."""
+        supervisor = self.supervisor
+        t_ns, alarm, key, present, detail, text = self._outages.measured(
+            report._replace(t_ns=max(report.t_ns, supervisor.now_ns)))
+        outputs = list(supervisor.tick(t_ns))
+        if present or key in supervisor.causes(alarm):
+            supervisor.report(t_ns, alarm, key, True, detail, text)
+        supervisor.report(t_ns, alarm, key, present, detail, text)
+        supervisor.board.settle(t_ns)
+        return [*outputs, *supervisor.tick(t_ns)]
 
     def _drops(self, dropped: int, now_ns: int) -> list[Report]:
         """Frames that came faster than they were supervised."""
@@ -297,26 +298,25 @@ class Live:
                 self._listen(self.ports[bus])
 
     def _readings(self) -> list[Reading]:
-        """What the UCS says of itself since the last call, in the order of the stamps."""
+        """What the UCS says of itself since the last call."""
         readings = list(self._gnss.take()) if self._gnss is not None else []
         if self._house is not None:
             readings += self._house.take(self._lateness_ns, self.dropped)
             self._lateness_ns = 0
-        readings.sort(key=_stamp)
         return readings
 
-    def _feed(self, frames: Sequence[Row], readings: Sequence[Reading]) -> list[Output]:
-        """Frames of several buses and the readings among them, in the order of their stamps."""
+    def _feed(self, frames: Sequence[Row], beside: Sequence[Reading | Report]) -> list[Output]:
+        """Frames of several buses, and the readings and reports among them, in the order of their stamps."""
         if self._recorder is not None:
             self._recorder.record(frames)
-        if not readings:
+        if not beside:
             return self.supervisor.receive_many(frames)
         outputs: list[Output] = []
         begin = 0
-        for reading in readings:
-            end = bisect_right(frames, reading.t_ns, begin, key=_stamp)
+        for one in beside:
+            end = bisect_right(frames, one.t_ns, begin, key=_stamp)
             outputs += self.supervisor.receive_many(frames[begin:end])
-            outputs += self._publish(reading)
+            outputs += self._tell(one) if isinstance(one, Report) else self._publish(one)
             begin = end
         return outputs + self.supervisor.receive_many(frames[begin:] if begin else frames)
 

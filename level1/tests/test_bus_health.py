@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from level1.bus_health import ALARMS, ERROR_BURST, QUIET_WINDOWS, WINDOW_NS, BusHealth, Report, Traffic
+from level1.bus_health import ALARMS, ERROR_BURST, QUIET_WINDOWS, WINDOW_NS, BusHealth, Outages, Report, Traffic
 from level1.event import Event
 from level1.frame import EXTENDED
 from level1.io.definitions import load
@@ -35,11 +35,11 @@ def quiet_windows(bus: BusHealth, number: int = QUIET_WINDOWS + 1) -> list[Repor
 
 
 class TestInterface:
-    def test_a_lost_interface_is_there_until_it_is_back_with_the_time_it_was_away(self, bus: BusHealth) -> None:
+    def test_a_lost_interface_is_there_until_it_is_back(self, bus: BusHealth) -> None:
         assert brief(bus.down(S, "No such device")) == [("CanBusDown", "implement", True)]
         assert bus.state == "BusDown" and bus.down(2 * S, "still") == []
         over, = bus.up(3 * S + S // 2)
-        assert (over.present, over.detail["AwaySeconds"], over.detail["Reason"]) == (False, 2.5, "No such device")
+        assert (over.t_ns, over.present, over.detail["Reason"]) == (3 * S + S // 2, False, "No such device")
         assert bus.state == "BusActive" and bus.up(4 * S) == []
 
     def test_bus_off_says_what_could_not_be_sent_too(self, bus: BusHealth) -> None:
@@ -60,6 +60,30 @@ class TestInterface:
         assert brief(bus.up(3 * S)) == [("CanBusOff", "implement", False), ("CanBusDown", "implement", False)]
 
 
+class TestOutages:
+    def down(self, t_ns: int, present: bool, bus: str = "implement") -> Report:
+        return Report(t_ns, "CanBusDown", bus, present, {"Bus": bus}, "")
+
+    def test_a_bus_was_away_from_when_it_was_first_told_lost_until_it_was_told_back(self) -> None:
+        outages = Outages()
+        for t_ns in (1_000 * S, 1_001 * S):
+            assert outages.measured(self.down(t_ns, True)) == self.down(t_ns, True)
+        outages.measured(self.down(1_002 * S, True, "tractor"))
+        back = outages.measured(self.down(1_002 * S + 345_678_901, False))
+        assert back.detail == {"Bus": "implement", "AwaySeconds": 2.346}
+        assert outages.measured(self.down(1_003 * S, False, "tractor")).detail["AwaySeconds"] == 1
+        outages.measured(self.down(1_010 * S, True))
+        assert outages.measured(self.down(1_011 * S, False)).detail["AwaySeconds"] == 1, "each outage for itself"
+
+    def test_of_one_that_was_lost_in_another_boot_nobody_knows(self) -> None:
+        assert Outages().measured(self.down(S, False)) == self.down(S, False)
+
+    def test_other_causes_are_left_alone(self, bus: BusHealth) -> None:
+        outages = Outages()
+        reports = [*bus.error(S, BUS_OFF, bytes(8)), *bus.heard(2 * S)]
+        assert [outages.measured(report) for report in reports] == reports
+
+
 class TestController:
     @pytest.mark.parametrize(("can_id", "data"), [(RESTARTED, bytes(8)), (CONTROLLER, controller(0x40))])
     def test_bus_off_is_over_when_the_driver_says_so(self, bus: BusHealth, can_id: int, data: bytes) -> None:
@@ -77,6 +101,13 @@ class TestController:
         assert quiet_windows(bus, 20) == [] and bus.state == "BusPassive"
         bus.error(S, CONTROLLER, controller(0x40))
         assert brief(quiet_windows(bus)) == [("CanBusErrors", "implement", False)]
+
+    def test_an_error_frame_heard_after_the_window_it_came_in_is_told_after_it(self, bus: BusHealth) -> None:
+        for _ in range(ERROR_BURST):
+            bus.error(S, 0x8, bytes(8))
+        at_the_end, = bus.window(2 * S, QUIET)
+        late, = bus.error(2 * S - 1, BUS_OFF, bytes(8))
+        assert (at_the_end.t_ns, late.t_ns) == (2 * S, 2 * S)
 
     def test_a_warning_is_no_alarm(self, bus: BusHealth) -> None:
         assert bus.error(S, CONTROLLER, controller(0x08)) == [] and bus.state == "BusWarning"

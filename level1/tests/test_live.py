@@ -476,6 +476,12 @@ def catalog() -> Catalog:
     return load(["flaming_tool.dbc"])
 
 
+@pytest.fixture(scope="module")
+def own() -> Catalog:
+    """The alarms of the UCS itself."""
+    return load(["ucs.dbc"])
+
+
 class Unit:
     """A live loop over the flaming tool's definitions, with clocks that stand; `log` is what happened, in order."""
 
@@ -580,8 +586,8 @@ class TestLive:
         unit.port._adopt(adapted(unit.wire))
         assert [entry[1] for entry in unit.turn_at(1_004)] == [0x650]
 
-    def test_a_device_is_asked_through_the_gate_which_lets_nothing_pass_that_writes(self) -> None:
-        unit = Unit(load(["ucs.dbc"]), devices=[Device(0, 42, history=True)])
+    def test_a_device_is_asked_through_the_gate_which_lets_nothing_pass_that_writes(self, own: Catalog) -> None:
+        unit = Unit(own, devices=[Device(0, 42, history=True)])
         unit.turn_at(1_002)
         read, write = bytes([0x40, 0x03, 0x10, 0, 0, 0, 0, 0]), bytes([0x2F, 0x03, 0x10, 0, 0, 0, 0, 0])
         for data in (write, read):
@@ -658,25 +664,37 @@ class TestLive:
         unit.turn_at(1_310)
         assert unit.told()[0] == (1.3, "raised")
 
-    def test_what_the_last_boot_left_of_a_bus_is_over_unless_it_is_reported_again(self) -> None:
-        catalog = load(["ucs.dbc"])
-        first = Supervisor(catalog, unit="a", boot=1, start_ns=0)
+    def test_what_the_last_boot_left_of_a_bus_is_over_unless_it_is_reported_again(self, own: Catalog) -> None:
+        first = Supervisor(own, unit="a", boot=1, start_ns=0)
         first.tick(0)
         for bus in ("implement", "gone"):
             first.report(0, "CanBusDown", bus, True, {"Bus": bus}, "")
         first.tick(1)
-        unit = Unit(catalog, restored=first.state())
+        unit = Unit(own, restored=first.state())
         unit.inbox.report([Report(1_000 * MS, "CanBusDown", "implement", True, {"Bus": "implement"}, "still")])
         unit.turn_at(1_003)
         causes = unit.live.supervisor.causes("CanBusDown")
         assert list(causes) == ["implement"]
-        unit.inbox.report([Report(1_500 * MS, "CanBusDown", "implement", False, {"Bus": "implement", "AwaySeconds": 0.5}, "")])
+        unit.inbox.report([Report(1_500 * MS, "CanBusDown", "implement", False, {"Bus": "implement"}, "")])
         unit.turn_at(1_503)
         cleared = [event for kind, event in (entry for entry in unit.log if entry[0] == "told") if event.event == "cleared"][-1]
         assert cleared.values == {"Bus": "implement", "AwaySeconds": 0.5} and float(cleared.t) == 1.5
 
-    def test_dropped_frames_are_an_alarm_that_counts_them(self) -> None:
-        unit = Unit(load(["ucs.dbc"]))
+    @pytest.mark.parametrize(("turn_ms", "raised_s"), [(1_400, 1.5), (1_520, 1.518)], ids=["late loop", "late thread"])
+    def test_what_befalls_a_bus_stands_at_its_time_and_the_bus_was_away_between_its_events(
+            self, own: Catalog, turn_ms: int, raised_s: float) -> None:
+        unit = Unit(own, monitor_ns=6 * MS)  # something is due every 6 ms
+        unit.turn_at(turn_ms)
+        unit.inbox.report([Report(1_500 * MS, "CanBusDown", "implement", True, {"Bus": "implement"}, "lost")])
+        unit.turn_at(2_000)
+        unit.inbox.report([Report(2_600 * MS, "CanBusDown", "implement", False, {"Bus": "implement"}, "lost")])
+        unit.turn_at(3_000)
+        raised, cleared = (event for kind, event in (entry for entry in unit.log if entry[0] == "told"))
+        assert (float(raised.t), float(cleared.t)) == (raised_s, 2.6)
+        assert cleared.values["AwaySeconds"] == round(float(cleared.t - raised.t), 3)
+
+    def test_dropped_frames_are_an_alarm_that_counts_them(self, own: Catalog) -> None:
+        unit = Unit(own)
         unit.turn_at(1_000)
         unit.inbox.put([Frame(1_001 * MS, 0x123, b"")] * 150)
         unit.turn_at(1_002)
@@ -692,7 +710,7 @@ class TestLive:
         unit.turn_at(1_002)
         assert wire.filters is not None and (EXTENDED | 0x80, 0xC000_00FF) in wire.filters
 
-    def test_orders_of_repairs_to_the_ucs_itself_are_obeyed_where_they_are_sent(self) -> None:
+    def test_orders_of_repairs_to_the_ucs_itself_are_obeyed_where_they_are_sent(self, own: Catalog) -> None:
         class Part:
             """Stands for the recorder or the receiver."""
 
@@ -710,11 +728,11 @@ class TestLive:
 
             def utc_offset_ns(self) -> int | None:
                 return None
-        catalog, log = load(["ucs.dbc"]), Part()
-        unit, gnss = Unit(catalog), Part()
+        log = Part()
+        unit, gnss = Unit(own), Part()
         unit.live._recorder, unit.live._gnss = log, gnss
         supervisor = unit.live.supervisor
-        supervisor.gate = Gate(catalog, supervisor.sendable(), frozenset({"UCS_HEALTH"}))
+        supervisor.gate = Gate(own, supervisor.sendable(), frozenset({"UCS_HEALTH"}))
         calm = {"TrafficLog": 0, "TimeSync": 1}
         unit.turn_at(1_000)
         for second in range(2, 200):
