@@ -26,8 +26,8 @@ HOLDS: Mapping[str, str] = {
     "ImplementSetUnsetFailure": "VEHICLE_IMPLEMENT_CMD"}
 """Which alarm's repair holds which command."""
 SILENT_NS = 1_000_000_000
-HARMLESS_NS = 600_000_000
-"""For so long, three cycles, Off, Unset and Hold are sent before anything else, once the vehicle takes orders again."""
+HARMLESS_FRAMES = 3
+"""So many frames with Off, Unset or Hold are sent before anything else, once the vehicle takes orders again."""
 RAISED, LOWERED = 100.0, 0.0
 LIMITS_KMH = {"slow": 1.0, "normal": 6.0}
 
@@ -73,7 +73,7 @@ class VehicleMission(Node):
         self._hitch: str | None = None
         self._status: Mapping[str, Value] = {}
         self._heard_ns: int | None = None
-        self._harmless_until_ns = start_ns
+        self._harmless_left: dict[str, int] = {}
         self._counter = 0
         self._once: list[str] = []
 
@@ -102,7 +102,7 @@ class VehicleMission(Node):
         match message:
             case "VEHICLE_STATUS":
                 if self._heard_ns is None or t_ns - self._heard_ns >= SILENT_NS:
-                    self._harmless_until_ns = t_ns + HARMLESS_NS
+                    self._begin_harmless()
                 self._heard_ns = t_ns
                 self._heed(t_ns, values)
                 self._status = values
@@ -115,12 +115,16 @@ class VehicleMission(Node):
         """What must not come back by itself is withdrawn."""
         held = status["Controller"] in HELD
         if held or status["EngineState"] == "Off":
-            self._harmless_until_ns = t_ns + HARMLESS_NS
+            self._begin_harmless()
         if held:
             self._withdraw_all(t_ns, str(status["Controller"]).lower())
         elif self._pto and status["EngineState"] == "Off":
             self._pto = False
             self.tell(t_ns, "withdraws the PTO: the engine does not run")
+
+    def _begin_harmless(self) -> None:
+        """The vehicle takes no On, Set and Move any more before it has heard Off, Unset and Hold."""
+        self._harmless_left = dict.fromkeys(HOLDS.values(), HARMLESS_FRAMES)
 
     def _withdraw_all(self, t_ns: int, why: str) -> None:
         if self._pto or self._implement or self._hitch is not None:
@@ -183,7 +187,9 @@ class VehicleMission(Node):
         if self._obedient and message in self.held:
             return None
         now_ns = self._next_tick_ns - self.TICK_NS
-        harmless = self._heard_ns is None or now_ns < self._harmless_until_ns
+        harmless = self._heard_ns is None or self._harmless_left.get(message, 0) > 0
+        if harmless and message in self._harmless_left:  # counted in frames: what a silence kept back was not heard
+            self._harmless_left[message] -= 1
         match message:
             case "VEHICLE_GUIDE":
                 if self._heard_ns is None or now_ns - self._heard_ns >= SILENT_NS:

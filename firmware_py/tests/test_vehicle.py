@@ -346,6 +346,15 @@ def test_nothing_comes_back_by_itself_when_it_is_ready_again(how: str) -> None:
     assert (bench.vehicle.pto.state, bench.vehicle.hitch.position, bench.vehicle.implement.position) == ("On", 0, "Set")
 
 
+def test_a_mission_controller_that_was_silent_when_the_vehicle_became_ready_is_obeyed_later() -> None:
+    bench = Bench().run(1).break_("", "manual").run(1)
+    bench.mission.inject(bench.simulation.now_ns, Statement("", None, "silent"))
+    bench.break_("", WORKS).run(5).order("hitch", "lower").order("implement", "set")
+    bench.mission.inject(bench.simulation.now_ns, Statement("", None, WORKS))
+    bench.run(10)
+    assert (bench.vehicle.hitch.position, bench.vehicle.implement.position) == (0, "Set")
+
+
 def test_after_an_engine_stop_the_pto_stays_off_until_off_was_commanded() -> None:
     bench = Bench().run(1).order("pto", "on").run(5)
     bench.break_("engine", "dies").run(10)
