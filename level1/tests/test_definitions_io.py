@@ -149,6 +149,7 @@ def test_a_reader_that_exceeds_its_bounds_is_ended_and_the_file_named(bound: str
     """An honest file does it when the bounds are small enough."""
     monkeypatch.setattr(definitions, bound, value)
     monkeypatch.setattr(definitions, "CPU_BYTES_PER_S", 1_000_000_000)
+    monkeypatch.setattr(definitions, "WALL_FACTOR", 600)
     signals = "\n".join(f' SG_ S{n} : {n % 8}|8@1+ (1,0) [0|0] "" X' for n in range(8))
     file = tmp_path / "large.dbc"
     file.write_text(HEAD + "".join(f"BO_ {1 << 31 | n} A{n}: 8 X\n{signals}\n" for n in range(8_000)))
