@@ -285,8 +285,8 @@ class Day:
             self._wrong.append(f"{event.t:.2f} s: FALSE {alarm} ({broken or 'nothing is broken'}): {event.values}")
 
     def _left_behind(self, alarm: str) -> bool:
-        """Whether it is a symptom, to be seen now, of what was broken before."""
-        return any(alarm in names and symptom.truth(self._world, past.fault.statement.index or 0)
+        """Whether it is a symptom, to be seen now, of what was broken before, or comes with one."""
+        return any((alarm in names or alarm in past.row.may) and symptom.truth(self._world, past.fault.statement.index or 0)
                    for past in self._past for names, symptom in zip(past.names, past.row.symptoms, strict=True))
 
     def _end(self, now_ns: int) -> None:
