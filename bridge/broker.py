@@ -15,7 +15,7 @@ from typing import Any
 
 from bridge.mqtt import Address, MqttError
 
-START_S = 10.0
+START_S = 60.0
 SHUTDOWN_S = 1.0
 """Patience with amqtt's own ending, which now and then never comes (it loses a cancellation of its reader)."""
 

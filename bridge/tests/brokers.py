@@ -6,18 +6,22 @@ program (`python -m benchmarks.nats` builds it and runs these tests).
 from __future__ import annotations
 
 import os
+import random
 import shutil
 import socket
 import subprocess
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
 from bridge.broker import EmbeddedBroker
 from bridge.mqtt import Address
 
+WAIT_S = 60.0
 NATS_SERVER = os.environ.get("NATS_SERVER", "")
+DICE = random.SystemRandom()
 SITES = ["mosquitto", *(["nats"] if NATS_SERVER else [])]
 """Those with certificates and rights."""
 KINDS = ["embedded", *SITES]
@@ -43,7 +47,7 @@ class BrokerProcess:
         file = Path(self._folder.name) / "configuration"
         file.write_text(configuration.format(port=self.address.port, other=free_port(), folder=self._folder.name))
         self._process = subprocess.Popen([program, "-c", str(file)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        end = time.monotonic() + 20
+        end = time.monotonic() + WAIT_S
         while not listens(self.address.port):
             assert self._process.poll() is None and time.monotonic() < end, f"{program} did not start"
             time.sleep(0.02)
@@ -58,7 +62,7 @@ class BrokerProcess:
 def start(kind: str, port: int = 0) -> Broker:
     """A broker of a kind, on a free port or on this one."""
     if kind == "embedded":
-        return EmbeddedBroker(port=port)
+        return EmbeddedBroker(port=port or free_port())
     if kind == "nats":
         return BrokerProcess(NATS_SERVER, NATS, port)
     return BrokerProcess(mosquitto(), MOSQUITTO, port)
@@ -72,10 +76,13 @@ def mosquitto() -> str:
 
 
 def free_port() -> int:
-    """A port that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A port that nobody listens on, of those that the kernel gives nobody by itself: so it is still free when it is needed, even
+    for a broker that comes back after a while."""
+    while True:
+        port = DICE.randrange(10_000, 30_000)
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 def listens(port: int) -> bool:

@@ -13,6 +13,7 @@ import msgspec
 from bridge import wire
 from bridge.mqtt import Address, MqttConnection, Received
 from bridge.session import Settings
+from bridge.tests.brokers import WAIT_S
 from level1.event import Event, seconds
 from level1.io.journal import Journal
 
@@ -29,8 +30,8 @@ def an_event(seq: int, boot: int = 1) -> Event:
 
 
 def eventually(condition: Callable[[], object]) -> None:
-    """Wait for what another thread or process will do; 20 s is far beyond any of it."""
-    end = time.monotonic() + 20
+    """Wait for what another thread or process will do; a minute is far beyond any of it."""
+    end = time.monotonic() + WAIT_S
     while not condition():
         assert time.monotonic() < end, "did not happen"
         time.sleep(0.01)
@@ -47,7 +48,7 @@ class Peer:
 
     def until(self, condition: Callable[[], object]) -> None:
         """Take in what comes until a condition holds."""
-        end = time.monotonic() + 20
+        end = time.monotonic() + WAIT_S
         while not condition():
             assert time.monotonic() < end, f"did not happen; came: {[message.topic for message in self.received]}"
             assert not self.connection.lost, self.connection.lost
@@ -87,7 +88,7 @@ class Unit:
 
     def __init__(self, folder: Path, broker: Address, unit: str = UNIT):
         self.path = folder / "journal.db"
-        self.journal = Journal(self.path, unit)
+        self.journal = Journal(self.path, unit, patience_ns=round(WAIT_S * 1e9))
         self.settings = Settings(self.path, unit, FLEET, broker, retry_ns=200_000_000, period_ns=50_000_000)
         self.said: list[str] = []
 

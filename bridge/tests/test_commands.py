@@ -39,7 +39,7 @@ class Site:
 
     def send(self, seq: int = 1, private: Ed25519PrivateKey | None = None, **changes: Any) -> bytes:
         now = seconds(time.monotonic_ns())
-        order = wire.Order(unit=UNIT, boot=self.unit.journal.boot, seq=seq, t=now, id=f"c-{seq}", name="pause", expires_t=now + 10)
+        order = wire.Order(unit=UNIT, boot=self.unit.journal.boot, seq=seq, t=now, id=f"c-{seq}", name="pause", expires_t=now + 25)
         order = msgspec.structs.replace(order, **changes)
         payload = wire.encode(signed(order, FLEET, "chief", private or self.chief))
         self.peer.send("command", payload)
@@ -134,7 +134,7 @@ def test_a_flood_of_strangers_is_counted_but_hardly_answered(site: Site) -> None
 def test_a_retained_command_is_refused(site: Site) -> None:
     site.thread.__exit__()
     now = seconds(time.monotonic_ns())
-    order = wire.Order(unit=UNIT, boot=1, seq=1, t=now, id="c-1", name="stop", expires_t=now + 10)
+    order = wire.Order(unit=UNIT, boot=1, seq=1, t=now, id="c-1", name="stop", expires_t=now + 25)
     payload = wire.encode(signed(order, FLEET, "chief", site.chief))
     site.peer.connection.publish(wire.topic(FLEET, UNIT, "command"), payload, 1, retain=True)
     site.thread = BridgeThread(msgspec.structs.replace(site.unit.settings, keys=site.keys), site.unit.said.append)

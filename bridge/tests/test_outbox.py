@@ -27,8 +27,11 @@ class Unit:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self.journal = Journal(folder / "journal.db", "tractor-7")
+        self.boot()
         self.start()
+
+    def boot(self) -> None:
+        self.journal = Journal(self.folder / "journal.db", "tractor-7", patience_ns=60 * S)
 
     def start(self) -> None:
         self.reader = Reader(self.folder / "journal.db")
@@ -44,7 +47,7 @@ class Unit:
 
     def reboot(self) -> None:
         self.journal.close()
-        self.journal = Journal(self.folder / "journal.db", "tractor-7")
+        self.boot()
 
     def close(self) -> None:
         self.kill()

@@ -12,6 +12,7 @@ from bridge import wire
 from bridge.broker import EmbeddedBroker
 from bridge.error import OutsideError
 from bridge.mqtt import MqttConnection
+from bridge.tests.brokers import WAIT_S, free_port
 from bridge.wire import Event, Monitor, seconds
 from level2.receiver import Receiver, ReceiverThread, Settings, event_line
 from level2.store import Arrival, Outcome, Store
@@ -27,7 +28,7 @@ class Setup:
     """A broker, a receiver in a thread, and a unit that does only what it is told to."""
 
     def __init__(self, folder: Path, silent_ns: int = 300_000_000):
-        self.broker = EmbeddedBroker()
+        self.broker = EmbeddedBroker(port=free_port())
         self.store = Store(folder / "level2.db")
         self.arrivals: list[Arrival] = []
         self.said: list[str] = []
@@ -39,7 +40,7 @@ class Setup:
         self.until(lambda: self.unit.ready and self.receiver.online)
 
     def until(self, condition: Callable[[], object]) -> None:
-        end = time.monotonic() + 20
+        end = time.monotonic() + WAIT_S
         while not condition():
             assert time.monotonic() < end, f"did not happen; said: {self.said}, acks: {self.acks}"
             assert not self.unit.lost, self.unit.lost
@@ -191,7 +192,7 @@ def test_a_broker_that_comes_back_is_found_again(tmp_path: Path) -> None:
     address = setup.broker.address
     setup.unit.abandon()
     setup.broker.close()
-    end = time.monotonic() + 20
+    end = time.monotonic() + WAIT_S
     while not any("trying on" in line for line in setup.said):
         assert time.monotonic() < end
         time.sleep(0.02)

@@ -33,7 +33,7 @@ UNIT = """
     from level1.io.journal import Journal
     from ucs.tests.chain import an_event
     path, pause_s = Path(sys.argv[1]), float(sys.argv[2])
-    with Journal(path, "tractor-7") as journal:
+    with Journal(path, "tractor-7", patience_ns=60 * 10**9) as journal:
         link = RunLink(path)
         for seq in range(1, 10**6):
             assert journal.append([an_event(seq, journal.boot)], b"")
@@ -86,7 +86,7 @@ class Chain:
 
     def kill(self, name: str, how: signal.Signals = signal.SIGKILL) -> int:
         self.processes[name].send_signal(how)
-        return self.processes[name].wait(timeout=20)
+        return self.processes[name].wait(timeout=60)
 
     def log(self, name: str) -> str:
         return (self.folder / f"{name}.log").read_text()

@@ -51,19 +51,21 @@ def test_random_kills_of_every_process_lose_nothing_and_double_nothing(tmp_path:
             chain.kill(name)
             chain.start(name)
             time.sleep(dice.uniform(0.1, 0.8))
-        chain.kill("unit")
-        chain.kill("bridge")  # whoever opens the journal next recovers a commit that the unit's end left half done, for good
-        with Reader(tmp_path / "journal.db") as reader:
+        eventually(lambda: len(chain.promised()) > 50, explain)
+        for name in ("unit", "bridge", "level2"):
+            chain.kill(name)
+        with Reader(tmp_path / "journal.db") as reader:  # recovers, for good, a commit that the unit's end left half done
             written = reader.events(limit=10**6)
-        connected = chain.log("bridge").count("connected")
-        chain.start("bridge")
-        eventually(lambda: chain.stored() >= len(written) and chain.log("bridge").count("connected") > connected, explain)
+        up = {(name, word): chain.log(name).count(word) for name, word in (("bridge", "connected"), ("level2", "receiving"))}
+        for name, _ in up:
+            chain.start(name)
+        eventually(lambda: chain.stored() >= len(written)
+                   and all(chain.log(name).count(word) > before for (name, word), before in up.items()), explain)
         assert chain.kill("bridge", signal.SIGTERM) == 0
         assert chain.kill("level2", signal.SIGTERM) == 0
     finally:
         chain.close()
     promised = chain.promised()
-    assert len(promised) > 50
     with Store(tmp_path / "level2.db") as store:
         found = store.events()
         assert found == written == read_events(tmp_path / "journal.db", limit=10**6)

@@ -145,7 +145,7 @@ def test_following_waits_for_a_journal_that_is_not_there_yet(tmp_path: Path) -> 
     assert follower.stdout and follower.stderr
     assert "waiting for `ucs run`" in follower.stderr.readline()
     follower.send_signal(signal.SIGINT)
-    assert follower.wait(timeout=20) == 0
+    assert follower.wait(timeout=60) == 0
     follower.stdout.close()
     follower.stderr.close()
 
@@ -160,7 +160,7 @@ def test_following_shows_events_as_they_come(tmp_path: Path) -> None:
         journal.append(EVENTS[1:2], b"")
         assert "1.2" in follower.stdout.readline()
         follower.send_signal(signal.SIGINT)
-        assert follower.wait(timeout=20) == 0
+        assert follower.wait(timeout=60) == 0
         follower.stdout.close()
 
 

@@ -63,7 +63,7 @@ def test_level2_says_where_it_listens_and_ends_at_a_signal(tmp_path: Path) -> No
     assert "embedded broker on mqtt://127.0.0.1:" in level2.stderr.readline()
     assert "receiving all fleets from mqtt://127.0.0.1:" in level2.stderr.readline()
     level2.send_signal(signal.SIGTERM)
-    assert (*level2.communicate(timeout=20), level2.returncode) == ("", "", 0)
+    assert (*level2.communicate(timeout=60), level2.returncode) == ("", "", 0)
 
 
 def test_a_site_is_made_and_how_to_use_it_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

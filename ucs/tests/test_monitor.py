@@ -29,7 +29,7 @@ from ucs.monitor import Listening, Monitor, Unit, pressed
 from ucs.pages import PAGES, Sight, View, screen, whole_page
 from ucs.standing import AlarmStanding, BusStanding, RepairStanding
 from ucs.terminal import harmless, keys_of, painted, plain
-from ucs.tests.running import awaited, beside_run, unit_toml
+from ucs.tests.running import WAIT_S, awaited, beside_run, patient_tool, unit_toml
 from ucs.watching import Heard, Watching, silent
 
 MS = 1_000_000
@@ -126,6 +126,7 @@ def test_alarms_as_they_look_from_here(catalog: Catalog) -> None:
 def test_attached_it_shows_the_repair_of_the_run_beside_the_signals_and_sends_nothing(tmp_path: Path) -> None:
     unit = tmp_path / "unit.toml"
     unit.write_text(unit_toml("test_monitor"))
+    patient_tool(tmp_path)
     payload = encode(load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"], {"Flaming": 1, "PilotFlame": 0, "Safeguard": 4}, None)
     shown: list[str] = []
     heard: list[int] = []
@@ -139,7 +140,7 @@ def test_attached_it_shows_the_repair_of_the_run_beside_the_signals_and_sends_no
             stack.callback(attached.close)
             monitor = Monitor("tractor-7 of fleet", load((), settings.bus_files, settings.bus_names), listening, attached)
             task = bus.send_periodic(can.Message(arbitration_id=0x210, is_extended_id=False, data=payload), 0.03)
-            stop = time.monotonic() + 20
+            stop = time.monotonic() + WAIT_S
             while not any("wait 30 s" in line for line in shown) and time.monotonic() < stop:
                 time.sleep(0.02)
                 monitor.drain()
@@ -253,7 +254,7 @@ class Pseudo:
         self.seen = ""
 
     def until(self, text: str) -> None:
-        stop = time.monotonic() + 30
+        stop = time.monotonic() + WAIT_S
         while text not in self.seen:
             assert time.monotonic() < stop, self.seen[-3000:]
             if select.select([self.master], [], [], 0.1)[0]:
@@ -265,7 +266,7 @@ class Pseudo:
 
     def ended(self) -> int:
         self.until("\x1b[?1049l")
-        code = self.process.wait(30)
+        code = self.process.wait(WAIT_S)
         assert termios.tcgetattr(self.slave) == self.before
         os.close(self.slave)
         os.close(self.master)

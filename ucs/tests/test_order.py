@@ -1,6 +1,7 @@
 """`ucs order`: someone at the machine lifts what level 2 may not, and nobody else passes for him."""
 from __future__ import annotations
 
+import time
 from decimal import Decimal
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from level1.io.live import encode_state
 from level1.memory import AlarmMemory, State
 from ucs.main import main
 from ucs.order import give
-from ucs.tests.running import awaited, beside_run, unit_toml
+from ucs.tests.running import WAIT_S, awaited, beside_run, unit_toml
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def unit(tmp_path: Path) -> Path:
     raised = Event("tractor-7", 1, 1, Decimal("1.000000000"), None, False, "PilotFlameOut", 3101, "High", "raised", 1, 0, {}, "out")
     memory = AlarmMemory("PilotFlameOut", 3, 1, False, 3, (), ())
     with Journal(tmp_path / "journal.db", "tractor-7") as writing:
-        assert writing.append([raised], encode_state(State("stopped", (memory,))))
+        writing.append([raised], encode_state(State("stopped", (memory,))))
     return file
 
 
@@ -48,13 +49,15 @@ def test_only_someone_at_the_machine_lets_a_stopped_unit_work_again(unit: Path, 
         assert awaited(journal).mode == "stopped"
         bridge = BridgeLink(journal)
         bridge.instruct(Order("1", "resume", origin="local"))
+        end = time.monotonic() + WAIT_S
         while not (answers := [answer for answer in bridge.receive() if hasattr(answer, "result")]):
-            pass
+            assert time.monotonic() < end
+            time.sleep(0.01)
         from_above.append(answers[0])
         bridge.close()
         assert awaited(journal).mode == "stopped"
         codes.append(main(["order", str(unit), "resume"]))
-        assert awaited(journal).mode == "running"
+        awaited(journal, lambda run: run.mode == "running")
         codes.append(main(["order", str(unit), "reset", "PilotFlameOut"]))
         awaited(journal, lambda run: not run.alarms)
         codes.append(main(["order", str(unit), "reset", "PilotFlameOot"]))

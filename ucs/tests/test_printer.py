@@ -38,7 +38,7 @@ def test_a_reader_that_is_gone_or_stopped_holds_nothing_up(reader: str) -> None:
         os.close(read)
     with subprocess.Popen([sys.executable, "-c", PROGRAM], stdout=write, stderr=subprocess.PIPE, text=True) as process:
         os.close(write)
-        _, err = process.communicate(timeout=30)
+        _, err = process.communicate(timeout=60)
     if reader == "stopped":
         os.close(read)
         # The thread is stuck in the pipe; the process ends all the same.
@@ -57,7 +57,7 @@ def test_what_nobody_read_in_time_is_counted() -> None:
             self.text = ""
 
         def write(self, text: str) -> None:
-            go.wait(10)
+            go.wait(60)
             self.text += text
 
         def flush(self) -> None:

@@ -7,7 +7,7 @@ import signal
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import can
@@ -24,20 +24,9 @@ from level1.memory import State
 from level1.supervisor import Supervisor
 from ucs.main import main
 from ucs.run import restored
+from ucs.tests.running import WAIT_S, beside_run, patient_tool, unit_toml
 
-UNIT = """
-[unit]
-name = "tractor-7"
-[[bus]]
-name = "implement"
-interface = "virtual"
-channel = "test_run"
-dbc = ["flaming_tool.dbc"]
-[repairs]
-armed = ["PilotFlameOut"]
-[journal]
-path = "journal.db"
-"""
+UNIT = unit_toml("test_run")
 
 
 @pytest.fixture
@@ -47,53 +36,25 @@ def unit(tmp_path: Path) -> Path:
     return file
 
 
-@pytest.fixture
-def tool() -> Iterator[Callable[[Callable[[can.Message], bool]], None]]:
-    """Starts a flaming tool whose pilot flame is out, on the virtual bus; ends this process's `ucs run` by SIGTERM when the
-    function, called with every message the tool hears, says so."""
-    message = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
-    payload = encode(message, {"Flaming": 1, "PilotFlame": 0, "Safeguard": 4}, None)
-    ended = threading.Event()
-    threads = []
-
-    def start(enough: Callable[[can.Message], bool]) -> None:
-        def live() -> None:
-            with can.Bus("test_run", interface="virtual") as bus:
-                stop = time.monotonic() + 10
-                while not ended.is_set():
-                    bus.send(can.Message(arbitration_id=0x210, is_extended_id=False, data=payload))
-                    heard = bus.recv(0.05)
-                    if heard and enough(heard) or time.monotonic() > stop:
-                        os.kill(os.getpid(), signal.SIGTERM)
-                        return
-
-        threads.append(threading.Thread(target=live))
-        threads[-1].start()
-
-    yield start
-    ended.set()
-    for thread in threads:
-        thread.join()
-
-
-def test_an_alarm_is_told_repaired_stored_and_broadcast(
-        unit: Path, tool: Callable[[Callable[[can.Message], bool]], None], capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_alarm_is_told_repaired_stored_and_broadcast(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
     heard: list[tuple[int, bytes]] = []
 
-    def enough(message: can.Message) -> bool:
-        heard.append((message.arbitration_id, bytes(message.data)))
-        return any(can_id == 0x110 for can_id, _ in heard) and any(can_id == 0x650 and data[0] & 3 == 2 for can_id, data in heard)
+    def body(_: Path) -> None:
+        """A flaming tool whose pilot flame is out, until it has heard the repair's command and the alarm's message."""
+        status = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
+        payload = encode(status, {"Flaming": 1, "PilotFlame": 0, "Safeguard": 4}, None)
+        end = time.monotonic() + WAIT_S
+        with can.Bus("test_run", interface="virtual") as bus:
+            while not (any(can_id == 0x110 for can_id, _ in heard)
+                       and any(can_id == 0x650 and data[0] & 3 == 2 for can_id, data in heard)):
+                assert time.monotonic() < end, heard
+                bus.send(can.Message(arbitration_id=0x210, is_extended_id=False, data=payload))
+                if (message := bus.recv(0.05)) is not None:
+                    heard.append((message.arbitration_id, bytes(message.data)))
 
-    for attempt in range(5):  # a machine that stands still for 0.3 s makes the status stale, and the attempt fail, as it should
-        heard.clear()
-        fresh = unit.parent / str(attempt)
-        fresh.mkdir()
-        unit = unit.rename(fresh / unit.name)
-        tool(enough)
-        assert main(["run", str(unit)]) == 0
-        out = capsys.readouterr().out.splitlines()
-        if "attempt 1, sends FLAMER_CMD" in "".join(out) and any(can_id == 0x110 for can_id, _ in heard):
-            break
+    patient_tool(unit.parent)
+    beside_run(unit, body)
+    out = capsys.readouterr().out.splitlines()
     assert out[0] == "tractor-7 of fleet"
     assert out[1] == "  bus implement: virtual test_run (flaming_tool.dbc)"
     assert re.match(r"  \d+ alarms; repairs armed: PilotFlameOut; passive: FlamingStartStopFailure, ", out[2])

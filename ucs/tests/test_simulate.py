@@ -380,7 +380,7 @@ def test_it_stops_cleanly_when_told_to(number: signal.Signals, code: int, tmp_pa
     assert process.stdout is not None
     process.stdout.readline()
     process.send_signal(number)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=60)
     assert process.returncode == code
     assert "end: " in out
     assert "Traceback" not in err

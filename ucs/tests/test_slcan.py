@@ -1,11 +1,9 @@
 """A CAN adapter on a serial line: `ucs run` by python-can's slcan over a pty; unplugged, plugged again, noisy, hanging."""
 from __future__ import annotations
 
-import os
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -15,7 +13,7 @@ from level1.event import Event
 from level1.io.definitions import load
 from level1.io.journal import read_events
 from level1.tests.lawicel import Adapter
-from ucs.main import main
+from ucs.tests.running import WAIT_S, beside_run, patient_tool
 
 UNIT = """
 [unit]
@@ -32,9 +30,9 @@ armed = ["PilotFlameOut"]
 [journal]
 path = "journal.db"
 """
-WAIT_S = 20.0
 IN_TIME_S = 1.0
-STATUS = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
+MESSAGES = load(["ucs.dbc", "flaming_tool.dbc"]).messages
+STATUS, UCS_ALARMS = MESSAGES["FLAMER_STATUS"], MESSAGES["UCS_ALARMS"]
 ALARMS, COMMAND = "t650", "t110"
 
 
@@ -42,52 +40,43 @@ ALARMS, COMMAND = "t650", "t110"
 def adapter(tmp_path: Path) -> Iterator[Adapter]:
     one = Adapter(tmp_path / "ttyCAN")
     (tmp_path / "unit.toml").write_text(UNIT.format(channel=one.path))
+    patient_tool(tmp_path)
     yield one
     one.stop()
 
 
 @pytest.fixture
-def story(adapter: Adapter, tmp_path: Path) -> Iterator[Callable[[Callable[[], None]], list[Event]]]:
-    """Runs `ucs run` in this process while the story is told by a thread; gives the events of its journal."""
-    failed: list[BaseException] = []
-    telling: list[threading.Thread] = []
-
-    def tell(it: Callable[[], None]) -> list[Event]:
-        def work() -> None:
-            try:
-                wait_for(lambda: any(line.startswith(ALARMS) for line in adapter.sent))
-                it()
-            except BaseException as error:
-                failed.append(error)
-            finally:
-                os.kill(os.getpid(), signal.SIGTERM)
-        telling.append(threading.Thread(target=work))
-        telling[-1].start()
-        assert main(["run", str(tmp_path / "unit.toml")]) == 0
-        telling[-1].join()
-        if failed:
-            raise failed[0]
+def story(adapter: Adapter, tmp_path: Path) -> Callable[[Callable[[Path], None]], list[Event]]:
+    """Runs `ucs run` in this process while the story is told by a thread, with the path of the journal; gives its events."""
+    def tell(it: Callable[[Path], None]) -> list[Event]:
+        def body(journal: Path) -> None:
+            wait_for(lambda: any(line.startswith(ALARMS) for line in adapter.sent))
+            it(journal)
+        beside_run(tmp_path / "unit.toml", body)
         return list(read_events(tmp_path / "journal.db"))
-    yield tell
+    return tell
 
 
-def wait_for(happened: Callable[[], object], within_s: float = WAIT_S) -> float:
-    """Until something has happened; gives how many seconds it took."""
-    begin = time.monotonic()
-    while not happened():
-        assert time.monotonic() < begin + within_s, "it did not happen"
-        time.sleep(0.005)
-    return time.monotonic() - begin
+def wait_for(happened: Callable[[], object], meanwhile: Callable[[int], None] = lambda _: None, pause_s: float = 0.005) -> None:
+    """Until something has happened. meanwhile: done again and again, with how often it was."""
+    end = time.monotonic() + WAIT_S
+    for times in count():
+        if happened():
+            return
+        assert time.monotonic() < end, "it did not happen"
+        meanwhile(times)
+        time.sleep(pause_s)
 
 
-def flame(adapter: Adapter, alight: bool, seconds: float) -> None:
-    """What a flaming tool says for a while."""
-    end = time.monotonic() + seconds
-    counter = 0
-    while time.monotonic() < end:
-        adapter.hear(STATUS.can_id, encode(STATUS, {"Flaming": 1, "PilotFlame": alight, "AliveCounter": counter % 4}, None))
-        counter += 1
-        time.sleep(0.05)
+def flame_out(adapter: Adapter, until: Callable[[], object]) -> None:
+    """What a flaming tool says whose pilot flame is out, until something has happened."""
+    wait_for(until, lambda times: adapter.hear(STATUS.can_id, encode(
+        STATUS, {"Flaming": 1, "PilotFlame": 0, "AliveCounter": times % 4}, None)), pause_s=0.05)
+
+
+def is_commanded(adapter: Adapter) -> bool:
+    """Whether the repair's command has come."""
+    return any(line.startswith(COMMAND) for line in adapter.sent)
 
 
 def told(events: list[Event], alarm: str) -> list[str]:
@@ -96,37 +85,32 @@ def told(events: list[Event], alarm: str) -> list[str]:
 
 def state(adapter: Adapter, alarm: str) -> int:
     """What the last alarm message of UCS_ALARMS on the adapter's bus says."""
-    message = load(["ucs.dbc"]).messages["UCS_ALARMS"]
-    line = next((line for line in reversed(adapter.sent) if line.startswith(f"T{message.can_id:08X}")), "")
-    place = message.signal(alarm).start
+    line = next((line for line in reversed(adapter.sent) if line.startswith(f"T{UCS_ALARMS.can_id:08X}")), "")
+    place = UCS_ALARMS.signal(alarm).start
     return int.from_bytes(bytes.fromhex(line[10:]), "little") >> place & 3
 
 
 def test_a_unit_is_supervised_and_commanded_through_it(
-        adapter: Adapter, story: Callable[[Callable[[], None]], list[Event]]) -> None:
-    def it() -> None:
-        flame(adapter, False, 1.0)
-        wait_for(lambda: any(line.startswith(COMMAND) for line in adapter.sent))
-    events = story(it)
+        adapter: Adapter, story: Callable[[Callable[[Path], None]], list[Event]]) -> None:
+    events = story(lambda _: flame_out(adapter, lambda: is_commanded(adapter)))
     assert told(events, "PilotFlameOut")[:2] == ["raised", "repair_started"]
     assert not told(events, "CanBusDown")
 
 
 def test_unplugged_it_is_an_alarm_in_time_and_plugged_again_it_works_without_a_restart(
-        adapter: Adapter, story: Callable[[Callable[[], None]], list[Event]], capsys: pytest.CaptureFixture[str]) -> None:
+        adapter: Adapter, story: Callable[[Callable[[Path], None]], list[Event]], capsys: pytest.CaptureFixture[str]) -> None:
     pulled: list[float] = []
 
-    def it() -> None:
+    def it(journal: Path) -> None:
         for _ in range(2):
             pulled.append(time.monotonic())
             adapter.unplug()
-            time.sleep(IN_TIME_S)
+            wait_for(lambda: told(read_events(journal), "CanBusDown").count("raised") == len(pulled), pause_s=0.05)
             adapter.sent.clear()
             adapter.plug()
             wait_for(lambda: any(line.startswith(ALARMS) for line in adapter.sent))
             wait_for(lambda: not state(adapter, "CanBusDown"))
-        flame(adapter, False, 1.0)
-        wait_for(lambda: any(line.startswith(COMMAND) for line in adapter.sent))
+        flame_out(adapter, lambda: is_commanded(adapter))
     events = story(it)
     down = [event for event in events if event.alarm == "CanBusDown"]
     assert [event.event for event in down] == ["raised", "cleared"] * 2
@@ -140,13 +124,12 @@ def test_unplugged_it_is_an_alarm_in_time_and_plugged_again_it_works_without_a_r
 
 
 def test_noise_and_half_lines_are_counted_and_what_follows_is_read(
-        adapter: Adapter, story: Callable[[Callable[[], None]], list[Event]], capsys: pytest.CaptureFixture[str]) -> None:
-    def it() -> None:
+        adapter: Adapter, story: Callable[[Callable[[Path], None]], list[Event]], capsys: pytest.CaptureFixture[str]) -> None:
+    def it(_: Path) -> None:
         for noise in (b"\xff\xfe\x80\r", b"t21", b"t2108ZZ\r", b"T1F\r", b"t\r", b"\r\r\a\r", b"x\r"):
             adapter.write(noise)
             time.sleep(0.02)
-        flame(adapter, False, 1.0)
-        wait_for(lambda: any(line.startswith(COMMAND) for line in adapter.sent))
+        flame_out(adapter, lambda: is_commanded(adapter))
     events = story(it)
     assert told(events, "PilotFlameOut")[:2] == ["raised", "repair_started"]
     assert not told(events, "CanBusDown")
@@ -154,10 +137,11 @@ def test_noise_and_half_lines_are_counted_and_what_follows_is_read(
 
 
 def test_one_that_hangs_does_not_hold_supervision_and_is_told(
-        adapter: Adapter, story: Callable[[Callable[[], None]], list[Event]]) -> None:
-    def it() -> None:
+        adapter: Adapter, story: Callable[[Callable[[Path], None]], list[Event]]) -> None:
+    def it(journal: Path) -> None:
         adapter.hang()
-        flame(adapter, False, 2.0)
+        end = time.monotonic() + 2.0
+        flame_out(adapter, lambda: time.monotonic() > end and told(read_events(journal), "PilotFlameOut"))
         adapter.sent.clear()
         adapter.drains = True
         wait_for(lambda: state(adapter, "SendFailed"))

@@ -18,7 +18,7 @@ from ucs.uplink import ALIVE_NS, BESIDE_NS, Uplink
 
 EVENT = Event("a", 1, 1, Decimal(1), None, False, "PilotFlameOut", 3101, "High", "raised", 1, 0, {}, "")
 MONITOR = Monitor("a", 1, Decimal(1), None, False, "burners", {}, {}, {})
-WAIT_S = 10.0
+WAIT_S = 30.0
 
 
 class Store:

@@ -133,7 +133,7 @@ class Site:
         self.path = folder / "journal.db"
         self.store = Store(folder / "level2.db")
         self.heard: list[Heard] = []
-        self.journal = Journal(self.path, UNIT)
+        self.journal = Journal(self.path, UNIT, patience_ns=60 * S)
         self.raised: dict[tuple[int, int], int] = {}
         self.seq = 0
         self.link = RunLink(self.path)
@@ -156,7 +156,7 @@ class Site:
 
     def reboot(self) -> None:
         self.journal.close()
-        self.journal = Journal(self.path, UNIT)
+        self.journal = Journal(self.path, UNIT, patience_ns=60 * S)
         self.seq = 0
 
     def turn(self) -> None:
