@@ -7,7 +7,8 @@ Theory of operation. It is told what to do (`flaming on`, `burner[2] high`) and 
     Working ──the tool left work mode by itself──▶ Purging        any ──flaming off ordered──▶ Idle
 
 Only Lighting and Working demand gas. It never lights without the purge, nor by the word of a tool that has said nothing for three
-cycle times, and never lights a flame again that went out in work: that is a repair.
+cycle times, nor while an alarm of the gas valve stands (`DANGERS`: someone has to look at it, and acknowledge), and never lights a
+flame again that went out in work: that is a repair.
 
 The rule of the two senders: while an alarm in FLAMER_ALARMS reads Repairing or LockedOut, it sends no FLAMER_CMD, because
 level 1 does. When all read Normal or Active again it goes on: Working when the pilot flame burns, else from Purging. A lock-out
@@ -33,6 +34,7 @@ FAILED_NS = 5_000_000_000
 LEFT_NS = 1_000_000_000
 """The tool may need so long to enter its work mode before its leaving counts."""
 
+DANGERS = ("FlameWithValveClosed", "GasValveNotClosed", "GasValveLeaks")
 LEVELS = ("off", "low", "high")
 
 
@@ -66,6 +68,7 @@ class MissionController(Node):
         self._heard_ns = start_ns
         self._stale_ns = 3 * codec.cycle_ns("FLAMER_STATUS")
         self._worked = False
+        self._danger = False
         self._obedient = True
 
     def order(self, now_ns: int, statement: Statement) -> None:
@@ -87,6 +90,7 @@ class MissionController(Node):
         if message == "FLAMER_STATUS":
             self._status, self._heard_ns = values, t_ns
             return
+        self._danger = any(values[alarm] != "Normal" for alarm in DANGERS)
         holding = next((alarm for alarm, state in values.items() if state in ("Repairing", "LockedOut")), None)
         if "LockedOut" in values.values() and self._flaming:
             self._flaming = False
@@ -114,7 +118,7 @@ class MissionController(Node):
         match self.state:
             case "Idle":
                 self._enter(t_ns, "Purging")
-            case "Purging" if t_ns - self._heard_ns <= self._stale_ns and status.get("Safeguard") == "Ready" and not burns:
+            case "Purging" if self._is_clear(t_ns) and not burns:
                 self._enter(t_ns, "Lighting")
                 self.tell(t_ns, "lights the pilot flame")
             case "Lighting" if burns:
@@ -130,6 +134,10 @@ class MissionController(Node):
                 self._watch_work(t_ns, in_state_ns)
             case _:
                 pass
+
+    def _is_clear(self, t_ns: int) -> bool:
+        """Whether the pilot flame may be lit, by what the tool says now."""
+        return t_ns - self._heard_ns <= self._stale_ns and self._status.get("Safeguard") == "Ready" and not self._danger
 
     def _watch_work(self, t_ns: int, in_state_ns: int) -> None:
         flaming = self._status.get("Flaming") == "On"

@@ -141,7 +141,7 @@ class AlarmMachine:
             self.delay.hold(t_ns)
         else:
             self.delay.cancel()
-            self.calm = False
+            self.calm = self.unlocked = False
 
     def expire(self, now_ns: int) -> None:
         """The on-delay or off-delay has been held to its end."""

@@ -47,20 +47,28 @@ class Gate:
         self._limits = {name: _limits(catalog.messages[name], name in readings) for name in self.allowed}
         self._j1939, self._questions, self._readable = frozenset(j1939), frozenset(questions), frozenset(readable)
 
-    def check(self, t_ns: int, name: str, data: bytes) -> int:
-        """Let a payload pass and give the time (ns) until which it may be sent. Raises Refused."""
+    def check(self, t_ns: int, name: str, data: bytes, *, safe: bool = False) -> int:
+        """Let a payload pass and give the time (ns) until which it may be sent. safe: into a safe state; these are counted apart,
+        so that a burst of others can't hold one up. Raises Refused.
+        """
         if name not in self.allowed:
             raise Refused(f"{name} is not on the list of messages the UCS may send")
         message = self.catalog.messages[name]
         if len(data) != message.length:
             raise Refused(f"{name}: {len(data)} bytes instead of {message.length}")
-        for signal, read, low, high, free in self._limits[name]:
+        if outside := self.outside(name, data):
+            raise Refused(outside)
+        self._count(t_ns, f"{name}, safe" if safe else name, name)
+        return t_ns + (message.cycle_ns or DEFAULT_LIFE_NS)
+
+    def outside(self, name: str, data: bytes) -> str:
+        """Which value of a payload of an allowed message is not within its limits; empty when all are."""
+        for signal, read, low, high, free in self._limits.get(name, ()):
             raw = read(data) or 0
             if not low <= raw <= high and not any(first <= raw <= last for first, last, _ in free):
                 physical = Fraction(signal.factor) * Fraction(raw) + Fraction(signal.offset)
-                raise Refused(f"{name}.{signal.name}: {float(physical):g} is outside {signal.minimum} … {signal.maximum}")
-        self._count(t_ns, name, name)
-        return t_ns + (message.cycle_ns or DEFAULT_LIFE_NS)
+                return f"{name}.{signal.name}: {float(physical):g} is outside {signal.minimum} … {signal.maximum}"
+        return ""
 
     def check_protocol(self, send: Send) -> None:
         """Let a frame of a protocol pass. Raises Refused."""

@@ -17,7 +17,7 @@ from level1.expression import ResendStep, SendStep, Step
 from level1.gate import Refused
 from level1.timer import FAR, Timers
 
-Transmit = Callable[[int, str, bytes, str], None]
+Transmit = Callable[[int, str, bytes, str, bool], None]
 
 
 class Owner(Protocol):
@@ -55,16 +55,17 @@ class Hold:
 
 
 class Holds:
-    """All command messages of a unit. transmit(t_ns, message, payload, reason) sends, or raises gate.Refused; freed(t_ns) is
-    told when messages have been handed back."""
+    """All command messages of a unit. transmit(t_ns, message, payload, reason, safe) sends, or raises gate.Refused; fits(message,
+    payload): whether all its values are within their limits; freed(t_ns) is told when messages have been handed back."""
 
-    def __init__(self, catalog: Catalog, board: Board, timers: Timers, transmit: Transmit, freed: Callable[[int], None],
-                 counters: Counter[str]):
+    def __init__(self, catalog: Catalog, board: Board, timers: Timers, transmit: Transmit, fits: Callable[[str, bytes], bool],
+                 freed: Callable[[int], None], counters: Counter[str]):
         self.catalog = catalog
         self.board = board
         self.timers = timers
         self.counters = counters
         self._transmit = transmit
+        self._fits = fits
         self._freed = freed
         self._holds: dict[str, Hold] = {}
 
@@ -83,13 +84,17 @@ class Holds:
         for hold in holds:
             if hold.owner is not None and hold.owner is not owner and hold.owner.rank >= owner.rank:
                 return hold.owner.name
+        losers = []
         for hold in holds:
-            if hold.owner is not None and hold.owner is not owner:
-                hold.owner.taken(t_ns, owner.name)
-                hold.payload = b""
             if hold.owner is not owner:
+                if hold.owner is not None:
+                    losers.append(hold.owner)
+                hold.payload = b""
+                hold.due = FAR
                 hold.before = self.last_command(hold.message.name)
-            hold.owner = owner
+                hold.owner = owner
+        for loser in losers:
+            loser.taken(t_ns, owner.name)
         return ""
 
     def release(self, owner: Owner, t_ns: int, but: Sequence[str] = ()) -> None:
@@ -114,18 +119,20 @@ class Holds:
         if hold.owner is None:
             return
         try:
-            self._transmit(t_ns, hold.message.name, hold.payload, f"held by the repair of {hold.owner.name}")
+            self._transmit(t_ns, hold.message.name, hold.payload, f"held by the repair of {hold.owner.name}", False)
         except Refused:
             self.counters["frames refused by the gate"] += 1
         if hold.message.cycle_ns:
             self.timers.set(hold, t_ns + hold.message.cycle_ns)
 
-    def transmit(self, owner: Owner, t_ns: int, step: SendStep | ResendStep) -> None:
-        """Send a step's frame now, and go on repeating it at its cycle time while the episode lasts. Raises Refused."""
+    def transmit(self, owner: Owner, t_ns: int, step: SendStep | ResendStep, *, safe: bool = False) -> None:
+        """Send a step's frame now, and go on repeating it at its cycle time while the episode lasts. Raises Refused.
+
+        safe: a step into the safe state, which other frames of the same message, however many, don't hold up."""
         hold = self._hold(step.message)
         own = hold.owner is owner and hold.payload
         payload = self._payload(step, hold.payload if own else self.last_command(step.message))
-        self._transmit(t_ns, step.message, payload, f"repair of {owner.name}")
+        self._transmit(t_ns, step.message, payload, f"repair of {owner.name}", safe)
         hold.payload = payload
         if hold.message.cycle_ns:
             self.timers.set(hold, t_ns + hold.message.cycle_ns)
@@ -146,11 +153,12 @@ class Holds:
         return tuple(frames)
 
     def last_command(self, name: str) -> bytes | None:
-        """The payload last commanded by whomever, as long as it still counts; None: nobody commands this now."""
+        """The payload last commanded by whomever, as long as it still counts; None: nobody commands this now, or out of its limits,
+        which no frame of ours may repeat: a stranger's nonsense must not keep a valve from being closed."""
         page = self.board.page(name)
         if page.level < 0 or (page.stale_level and page.level >= page.stale_level) or len(page.data) != page.message.length:
             return None
-        return page.data
+        return page.data if self._fits(name, page.data) else None
 
     def _hold(self, name: str) -> Hold:
         if name not in self._holds:

@@ -16,7 +16,9 @@ condition goes away meanwhile clears like any other; should it be raised again, 
 
 From the first attempt to the end of the episode the repair owns its command messages: it repeats them at their cycle time,
 and the alarm signal on the bus reads Repairing, upon which other programs stop sending them. One message serves one repair at a
-time; an alarm of higher priority takes it from one of lower. A lock-out goes on holding those that are sent at a cycle time.
+time; an alarm of higher priority takes it from one of lower. A lock-out goes on holding those that are sent at a cycle time, also
+against attempts of its own priority. While nobody knows when the next attempt may begin (the unit is stopped, the feedback is
+missing), only a safe state is held; anything else is handed back: whoever commands may have other orders by now.
 
 An attempt does not start (it waits) while its feedback is unknown, its message belongs to another, or the unit is stopped or
 paused from above. A repair that is not armed runs passive: it reports once for each activation what it would have sent.
@@ -91,8 +93,8 @@ class RepairMachine:
 
     @property
     def rank(self) -> int:
-        """Higher takes a command message from lower."""
-        return PRIORITIES.index(self.alarm.definition.priority)
+        """Higher takes a command message from lower; a lock-out takes it from an attempt of its own priority."""
+        return 2 * PRIORITIES.index(self.alarm.definition.priority) + (self.alarm.state == LOCKED_OUT)
 
     @property
     def messages(self) -> list[str]:
@@ -142,9 +144,12 @@ class RepairMachine:
     def circumstances_changed(self, t_ns: int) -> None:
         """The unit was stopped, paused or released, or a command message has become free."""
         if self.alarm.state == LOCKED_OUT:
-            self._hold_safe_state(t_ns)
+            if any(self.holds.owner(message) is not self for message in self.lasting):
+                self._hold_safe_state(t_ns)
         elif self.phase == RUNNING and (why := self.host.forbidden(self.definition)):
             self.fail(t_ns, why)
+        elif self.phase == PAUSING and self.host.forbidden(self.definition):
+            self._hand_back(t_ns)
         elif self.phase == WAITING:
             self.consider(t_ns)
 
@@ -157,6 +162,7 @@ class RepairMachine:
         self.due = FAR
         self.phase = WAITING
         self.alarm.enter(t_ns, ACTIVE)
+        self.holds.release(self, t_ns)
 
     def expire(self, now_ns: int) -> None:
         """A wait is over, an expect has run out, or the pause between attempts has passed."""
@@ -188,6 +194,8 @@ class RepairMachine:
         self.begun_ns = begun_ns
         if self.alarm.state == LOCKED_OUT:
             self._hold_safe_state(t_ns)
+        elif self.alarm.state == REPAIRING and not self.host.is_armed(self.alarm):
+            self.alarm.state = ACTIVE
         elif self.alarm.state == REPAIRING:
             self.holds.claim(self, t_ns, self.messages)
             self.fail(t_ns, "the supervisor was restarted during the attempt")
@@ -211,8 +219,10 @@ class RepairMachine:
         if alarm.state in (NORMAL, LOCKED_OUT):
             return
         if alarm.zone != Zone.RAISE:
-            if alarm.zone in (Zone.CLEAR, Zone.NEITHER) and self.phase == WAITING:
+            if self.phase == WAITING and alarm.zone in (Zone.CLEAR, Zone.NEITHER):
                 self._end(t_ns)
+            elif self.phase == WAITING:
+                self._hand_back(t_ns)
             return
         if not self.host.is_armed(alarm):
             self._report_passive(t_ns)
@@ -226,8 +236,9 @@ class RepairMachine:
             return
         self.phase = WAITING
         if self.feedback() or self.host.forbidden(self.definition) or self.holds.claim(self, t_ns, self.messages):
-            return
-        self._start(t_ns)
+            self._hand_back(t_ns)
+        elif self.phase == WAITING:  # still: what the claim has set free may have led here already
+            self._start(t_ns)
 
     def spent(self, t_ns: int) -> bool:
         """Whether the budget of attempts within the window is used up."""
@@ -293,7 +304,7 @@ class RepairMachine:
             return
         if self.definition.safe_between:
             self._safe_state(t_ns)
-        else:
+        elif not self.host.forbidden(self.definition):
             self.holds.restore(self, t_ns)
         self.phase = PAUSING
         if not self.definition.pause_ns:
@@ -301,13 +312,24 @@ class RepairMachine:
             return
         self.pause_end_ns = t_ns + self.definition.pause_ns
         self.timers.set(self, self.pause_end_ns)
+        if self.host.forbidden(self.definition):
+            self._hand_back(t_ns)
         self._end_if_over(t_ns)
+
+    @property
+    def _rests_safely(self) -> bool:
+        return self.definition.safe_between and bool(self.definition.give_up)
 
     def _end_if_over(self, t_ns: int) -> None:
         """A pause in which no safe state is held ends with the condition."""
-        safe = self.definition.safe_between and self.definition.give_up
-        if not safe and self.alarm.zone in (Zone.CLEAR, Zone.NEITHER):
+        if not self._rests_safely and self.alarm.zone in (Zone.CLEAR, Zone.NEITHER):
             self._end(t_ns)
+
+    def _hand_back(self, t_ns: int) -> None:
+        """No attempt can begin for now: hold nothing but a safe state."""
+        if not self._rests_safely and self.alarm.state == REPAIRING:
+            self.alarm.enter(t_ns, ACTIVE)
+            self.holds.release(self, t_ns)
 
     def _report_failure(self, t_ns: int, why: str) -> None:
         self.due = FAR
@@ -330,7 +352,7 @@ class RepairMachine:
         for step in self.definition.give_up:
             if isinstance(step, (SendStep, ResendStep)):
                 try:
-                    self.holds.transmit(self, t_ns, step)
+                    self.holds.transmit(self, t_ns, step, safe=True)
                 except Refused:
                     continue
 

@@ -92,7 +92,7 @@ class Supervisor:
         self._raised: dict[str, deque[int]] = {}
         self._activations: Counter[str] = Counter()
         self._counts: list[_Window] = []
-        self.holds = Holds(catalog, self.board, self.timers, self.send, self._circumstances_changed, self.counters)
+        self.holds = Holds(catalog, self.board, self.timers, self.send, self._fits, self._circumstances_changed, self.counters)
         self._inputs: dict[str, list[tuple[str, Callable[[int], Any]]]] = {}
         self._watches: list[Watch] = []
         self._repairs: dict[str, RepairMachine] = {}
@@ -509,9 +509,10 @@ class Supervisor:
 
     # --- sending ----------------------------------------------------------------------------------------------------------
 
-    def send(self, t_ns: int, name: str, payload: bytes, reason: str) -> None:
-        """Hand a frame out through the gate; the board then knows it as the last one commanded. Raises Refused."""
-        expires_ns = self.gate.check(t_ns, name, payload)
+    def send(self, t_ns: int, name: str, payload: bytes, reason: str, safe: bool = False) -> None:
+        """Hand a frame out through the gate; the board then knows it as the last one commanded. safe: it leads into a safe state.
+        Raises Refused."""
+        expires_ns = self.gate.check(t_ns, name, payload, safe=safe)
         message = self.catalog.messages[name]
         for bus in self.catalog.buses.get(name, (0,)):
             key = frame_key(message.can_id, message.extended, bus)
@@ -521,6 +522,9 @@ class Supervisor:
         page = self.board.pages.get(name)
         if page is not None:
             page.receive(t_ns, payload)
+
+    def _fits(self, name: str, payload: bytes) -> bool:
+        return not self.gate.outside(name, payload)
 
     # --- commands ---------------------------------------------------------------------------------------------------------
 

@@ -82,6 +82,14 @@ def test_it_does_not_light_by_the_last_word_of_a_tool_that_is_silent() -> None:
     assert mission.tool.hazards == []
 
 
+def test_it_does_not_light_while_an_alarm_of_the_gas_valve_waits_for_someone_to_look() -> None:
+    mission = Mission()
+    mission.hand.alarms["GasValveLeaks"] = "Active"
+    assert mission.run(0.5).order("flaming", "on").run(5).controller.state == "Purging"
+    mission.hand.alarms["GasValveLeaks"] = "Normal"
+    assert mission.run(5).controller.state == "Working"
+
+
 def test_it_stops_when_ordered() -> None:
     mission = Mission().working().order("burner", "high").run(2).order("flaming", "off").run(2)
     assert mission.controller.state == "Idle"

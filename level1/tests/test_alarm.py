@@ -6,9 +6,10 @@ from decimal import Decimal
 
 import pytest
 
+from level1.catalog import Repair
 from level1.command import Order
 from level1.event import Event, Monitor, Result, encode
-from level1.expression import AlarmState, And, Compare, Count, Elapsed, Number, Quality, Silent
+from level1.expression import AlarmState, And, Compare, Count, Elapsed, ExpectStep, Number, Quality, Silent
 from level1.frame import EXTENDED, REMOTE, Frame
 from level1.supervisor import Supervisor
 from level1.tests.build import MS, SECOND, alarm, catalog, compare, events, frame, message, sends, signal, supervisor
@@ -249,3 +250,14 @@ def test_an_event_names_the_raised_it_belongs_to_also_after_a_restart() -> None:
     assert [(event.event, event.instance, event.seq) for event in cleared] == [("cleared", 41, 1)]
 
 
+
+
+def test_a_reset_counts_for_nothing_once_the_cause_is_back() -> None:
+    """Given while the off-delay ran; it must not clear the alarm an hour later."""
+    repair = Repair((ExpectStep(compare("TANK.Pump", "==", 1), SECOND, "Pump"),), attempts=1)
+    target = supervisor([TANK], [alarm("Low", LOW, off_delay_ns=SECOND, repair=repair)])
+    levels = [(n / 10, 10 if n < 20 or 25 <= n < 40 else 50) for n in range(80)]
+    feed(target, *levels[:22])
+    assert target.alarm_states()["Low"] == 3
+    assert target.command(Order("r", "reset", "Low", origin="local"), target.now_ns)[-1].outcome == "done"  # type: ignore[union-attr]
+    assert feed(target, *levels[22:]) == [] and target.alarm_states()["Low"] == 3

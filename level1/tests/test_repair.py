@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from decimal import Decimal
 from typing import Any
 
 import msgspec
@@ -467,3 +468,91 @@ def test_a_lock_out_goes_on_holding_cyclic_commands_only_so_that_others_can_use_
         ("First", "raised"), ("First", "repair_started"), ("First", "repair_failed"), ("First", "locked_out"),
         ("Second", "raised"), ("Second", "repair_started"), ("Second", "repaired"), ("Second", "cleared")]
     assert [send.t_ns for send in sends(outputs, "RESTART")] == [0, 5 * SECOND]
+
+
+def test_a_stranger_that_commands_what_is_out_of_its_limits_does_not_keep_the_valve_open() -> None:
+    """The safe state names some signals; the others must not come from a frame that the gate would refuse."""
+    limited = msgspec.structs.replace(COMMAND, signals=(*COMMAND.signals[:2], signal("Burner", 8, 8, minimum=Decimal(0),
+                                                                                     maximum=Decimal(2))))
+    tool = Flamer(supervisor([STATUS, limited], [pilot_flame_out()]))
+    tool.run(1)
+    tool.target.receive(Frame(tool.now, frame_key(COMMAND.can_id, False), b"\x01\xaa" + bytes(6)))
+    tool.flame = 0
+    assert words(tool.run(0.5)) == ["raised", "repair_started"] and tool.gas == 0
+    assert {send.data[:2] for send in sends(tool.outputs, "FLAMER_CMD")} == {b"\0\0"}
+
+
+def test_a_burst_of_commands_does_not_hold_up_the_safe_state() -> None:
+    tool = flamer()
+    tool.flame = 0
+    tool.run(30.4)
+    assert (tool.gas, tool.igniter) == (1, 1)
+    tool.target.gate.recent["FLAMER_CMD"] = [tool.now] * 20
+    tool.order("stop")
+    assert words(events(tool.outputs))[-1] == "repair_failed" and (tool.gas, tool.igniter) == (0, 0)
+
+
+@pytest.mark.parametrize("phase", ["attempt", "pause"])
+def test_a_harmless_repair_repeats_nothing_while_the_unit_is_stopped(phase: str) -> None:
+    """What was commanded before the episode is an order of then: whoever commands must be able to take it back."""
+    target, outputs = _paused_repair(safe_between=False)
+    if phase == "attempt":
+        outputs += _actual(target, 25, 125, 3)
+        assert target.alarm_states()["Wrong"] == 2
+    outputs += target.command(Order("x", "stop"), target.now_ns)
+    stopped = target.now_ns
+    outputs += _actual(target, 130, 400, 3)
+    assert [send for send in sends(outputs, "VALVES") if send.t_ns > stopped] == [] and target.alarm_states()["Wrong"] == 1
+    outputs += target.command(Order("y", "resume", origin="local"), target.now_ns)
+    assert target.alarm_states()["Wrong"] == 2 and words(events(outputs))[-1] == "repair_started"
+
+
+def test_a_harmless_repair_repeats_nothing_while_its_feedback_is_missing() -> None:
+    target, outputs = _paused_repair(safe_between=False)
+    outputs += target.tick(60 * SECOND)
+    assert sends(outputs, "VALVES")[-1].t_ns <= 12 * SECOND and target.alarm_states()["Wrong"] == 1
+
+
+def test_a_repair_that_loses_one_of_its_messages_lets_go_of_the_others() -> None:
+    """Its alarm no longer reads Repairing: others send them again."""
+    more = message("MORE", 0x403, [signal("Set", 0, 8)], senders=("UCS", "MISSION"))
+    weak = Repair((SendStep("VALVES", {"Set": 1}), SendStep("MORE", {"Set": 1}), ExpectStep(compare("ACTUAL.Is", "==", 7),
+                                                                                          5 * SECOND, "Is == 7")), attempts=3)
+    strong = Repair((SendStep("VALVES", {"Set": 2}), ExpectStep(compare("ACTUAL.Is", "==", 7), 5 * SECOND, "Is == 7")))
+    target = supervisor([VALVES, more, ACTUAL], [
+        alarm("Weak", compare("ACTUAL.Is", "!=", 7), priority="Low", repair=weak),
+        alarm("Strong", compare("ACTUAL.Is", "==", 4), 2, repair=strong)])
+    outputs = list(_actual(target, 0, 10, 3))
+    assert {send.message for send in sends(outputs, "MORE")} == {"MORE"}
+    taken = target.now_ns
+    outputs += _actual(target, 10, 30, 4)
+    assert target.alarm_states() == {"Weak": 1, "Strong": 2}
+    assert [send for send in sends(outputs, "MORE") if send.t_ns > taken + 100 * MS] == []
+
+
+def test_a_lock_out_is_not_overruled_by_an_attempt_of_its_own_priority() -> None:
+    """It takes the message from one that is under way, which then waits."""
+    trial = Repair((SendStep("VALVES", {"Set": 1}), ExpectStep(compare("ACTUAL.Is", "==", 7), 5 * SECOND, "Is == 7"),
+                    SendStep("VALVES", {"Set": 1})), (SendStep("VALVES", {"Set": 0}),), attempts=1)
+    target = supervisor([VALVES, ACTUAL], [alarm("First", compare("ACTUAL.Is", "<", 4), repair=trial),
+                                           alarm("Second", compare("ACTUAL.Is", ">", 3), 2, repair=trial)])
+    outputs = list(_actual(target, 0, 60, 3))
+    assert target.alarm_states()["First"] == 3
+    outputs += _actual(target, 60, 70, 4)
+    outputs += target.command(Order("x", "reset", "First", origin="local"), target.now_ns)
+    assert target.alarm_states() == {"First": 0, "Second": 2}
+    outputs += _actual(target, 70, 90, 3)
+    assert target.alarm_states()["First"] == 3, "its budget of an hour is spent"
+    assert {send.data[0] for send in sends(outputs, "VALVES") if send.t_ns > 7 * SECOND} == {0}
+    assert ("Second", "repair_failed") in [(name, word) for _, name, word in events(outputs)]
+
+
+def test_an_attempt_that_a_restart_ended_is_not_gone_on_with_where_the_repair_is_no_longer_armed() -> None:
+    tool = flamer()
+    tool.flame = 0
+    tool.run(20)
+    again = supervisor([STATUS, COMMAND], [pilot_flame_out()], boot=2, restored=tool.target.state(), start_ns=tool.now, armed=())
+    successor = Flamer(again)
+    successor.now, successor.flame = tool.now, 0
+    assert words(successor.run(60)) == ["repair_started"] and sends(successor.outputs, "FLAMER_CMD") == []
+    assert again.alarm_states()["PilotFlameOut"] == 1
