@@ -127,8 +127,9 @@ def test_a_missing_interface_and_one_that_is_down_are_one_line(
         process: Callable[..., Process], log: Path, set_link: Callable[[str, bool], None]) -> None:
     missing = process("replay", log, "--onto", "vcan7")
     assert missing.wait(START_S) == 2
-    assert missing.err == ["ucs: there is no interface vcan7; create it: ip link add vcan7 type vcan && ip link set vcan7 up"]
+    assert missing.err == ["ucs: bus vcan7: there is no interface vcan7; create it: ip link add vcan7 type vcan && "
+                           "ip link set vcan7 up"]
     set_link("vcan0", False)
     down = process("replay", log, "--onto", "vcan0")
     assert down.wait(START_S) == 2
-    assert len(down.err) == 1 and "can't be sent: " in down.err[0] and down.err[0].endswith("is the interface up?")
+    assert down.err == ["ucs: bus vcan0: the interface vcan0 is down; bring it up: ip link set vcan0 up"]

@@ -96,6 +96,17 @@ def _budget(repair: Repair) -> Iterator[Doubt]:
                     f"{_s(repair.window_ns)}: it may never give up", "make the window longer")
 
 
+def ageless(alarms: Iterable[Alarm], messages: Messages) -> Iterator[tuple[Alarm, Doubt]]:
+    """Messages of others without a cycle time, each once: what they said last stays true when their sender has fallen silent."""
+    told: set[str] = set()
+    for alarm in alarms:
+        for name in dict.fromkeys(message for message, signal in reach.inputs(alarm.when) if message and signal):
+            if name not in told and messages[name].cycle_ns is None and not messages[name].sent_by_ucs:
+                told.add(name)
+                yield alarm, Doubt("AlarmWhen", "warning", f"{name} has no cycle time: its values never grow old, so its sender "
+                                   "looks healthy when it has fallen silent", "set GenMsgCycleTime")
+
+
 def circles(alarms: Iterable[Alarm]) -> Iterator[tuple[Alarm, tuple[str, ...]]]:
     """Alarms whose conditions ask, in the end, for their own state, each circle once: they would never come to rest."""
     by_name = {alarm.name: alarm for alarm in alarms}

@@ -148,6 +148,17 @@ class DbcText:
         """1-based line of an offset."""
         return bisect_right(self._newlines, offset - 1) + 1
 
+    def open_text(self, line: int) -> tuple[int, int] | None:
+        """Where a text begins and ends whose closing quote is missing, up to a line with a mistake: it ends in a later line than
+        it begins, at a quote with which another one seems to begin. None where there is none."""
+        for match in re.finditer(STRING, self.text, re.DOTALL):
+            begins, ends = self.line_at(match.start()), self.line_at(match.end() - 1)
+            if ends > line:
+                break
+            if begins < ends and re.match(r"[^\s;,]", self.text[match.end():match.end() + 1]):
+                return begins, ends
+        return None
+
     def attribute_line(self, name: str, message_id: int, signal: str = "") -> int:
         """Line of a message's or signal's attribute, 0 when it is not set there."""
         kind = "SG_" if signal else "BO_"

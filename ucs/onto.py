@@ -14,7 +14,9 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from level1.frame import ERROR, EXTENDED, REMOTE, Frame
-from level1.io.error import OutsideError, did_you_mean
+from level1.io.can import check_bus
+from level1.io.config import Bus
+from level1.io.error import OutsideError
 from level1.io.message import CLASSIC_BYTES
 
 if TYPE_CHECKING:
@@ -112,9 +114,7 @@ def opened(targets: Sequence[tuple[str, str]], interface: str | None, bitrate: i
 
 def _open(channel: str, interface: str, bitrate: int | None) -> can.BusABC:
     import can
-    from can.interfaces import VALID_INTERFACES
-    if interface not in VALID_INTERFACES:
-        raise OutsideError(f'no interface is called "{interface}"{did_you_mean(interface, VALID_INTERFACES)}')
+    check_bus(Bus(name=channel, channel=channel, interface=interface, bitrate=bitrate))
     options: dict[str, Any] = {"fd": True} if interface == INTERFACE else {}
     if bitrate is not None:
         options["bitrate"] = bitrate
@@ -122,15 +122,7 @@ def _open(channel: str, interface: str, bitrate: int | None) -> can.BusABC:
     try:
         return can.Bus(channel=channel, interface=interface, ignore_config=True, **options)
     except (can.CanError, OSError, ImportError, NotImplementedError, TypeError, ValueError) as error:
-        if isinstance(error, OSError) and error.errno == errno.ENODEV:
-            raise OutsideError(f"there is no interface {channel}; {_create(channel)}") from None
         raise OutsideError(f"{interface} {channel} can't be opened: {_reason(error)}") from None
-
-
-def _create(channel: str) -> str:
-    if channel.startswith("vcan"):
-        return f"create it: ip link add {channel} type vcan && ip link set {channel} up"
-    return "plug the adapter in; `ip link` lists what is there"
 
 
 def _is_full(error: Exception) -> bool:

@@ -16,7 +16,7 @@ from level1.canopen import Device
 from level1.catalog import LOCKED_OUT, Catalog
 from level1.event import Event
 from level1.io import config, definitions
-from level1.io.can import Port
+from level1.io.can import Port, check_name
 from level1.io.canopen import HistoryReader, devices
 from level1.io.config import Config
 from level1.io.error import OutsideError
@@ -79,11 +79,13 @@ def run(args: Namespace) -> int:
     config.check_armed(settings, catalog)
     own = readings.messages(settings, catalog)
     known = devices(settings)
+    for bus in settings.bus:
+        check_name(bus)
+    if settings.journal is None:
+        raise config.ConfigError(f'{settings.path}: journal: missing; add [journal] with path = "journal.db"')
     if args.check:
         print(*_start_lines(settings, catalog), f"{settings.path}: good", sep="\n")
         return 0
-    if settings.journal is None:
-        raise config.ConfigError(f'{settings.path}: journal: missing; add [journal] with path = "journal.db"')
     with ExitStack() as stack:
         printer = stack.enter_context(Printer())
         inbox = Inbox()

@@ -202,6 +202,8 @@ def _run_live(args: argparse.Namespace, scenario: Scenario, cast: Cast, on_frame
     import can
 
     from firmware_py.live_bus import BusLost, LiveBus
+    from level1.io.can import check_bus
+    from level1.io.config import Bus
     if args.bus and (args.interface or args.channel):
         raise OutsideError("--bus names a SocketCAN interface: give it, or --interface and --channel, not both")
     logging.getLogger("can").addHandler(logging.NullHandler())  # python-can would print each failed attempt to open a lost bus
@@ -209,6 +211,7 @@ def _run_live(args: argparse.Namespace, scenario: Scenario, cast: Cast, on_frame
     if args.bitrate:
         options["bitrate"] = args.bitrate
     name = f"{options['interface']}:{options['channel']}" if args.interface else str(options["channel"])
+    check_bus(Bus(name=name, channel=str(options["channel"]), interface=options["interface"]))
     clock = _Clock()
     tell = _teller(sys.stdout, flush=True)
     bus = LiveBus(lambda: can.Bus(**options), name, cast.participants, clock,

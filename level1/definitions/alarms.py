@@ -1,10 +1,11 @@
 """Alarms and their repairs: from the attributes of a signal to an `Alarm`, and what is doubtful about all of them together."""
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from level1 import check, resolver
 from level1.catalog import Alarm, Message, Repair, Signal
+from level1.check import Doubt
 from level1.definitions.attributes import ATTRIBUTES, Place
 from level1.expression import Expression, Step
 from level1.resolver import Scope
@@ -132,8 +133,10 @@ def alarms_at(places: Iterable[AlarmPlace], scope: Scope) -> list[Alarm]:
     found = [(alarm, place) for message, signal, place in places if (alarm := _alarm(message, signal, place, scope))]
     _check_codes(places)
     for alarm, place in found:
-        _take_doubts(alarm, place, scope.messages)
+        _take_doubts(check.doubts(alarm, scope.messages), place)
     places_by_name = {alarm.name: place for alarm, place in found}
+    for alarm, doubt in check.ageless((alarm for alarm, _ in found), scope.messages):
+        _take_doubts((doubt,), places_by_name[alarm.name])
     for alarm, circle in check.circles(alarm for alarm, _ in found):
         places_by_name[alarm.name].note("AlarmWhen", f"it depends on its own state: {' -> '.join(circle)}",
                                         "take one of the states out of it")
@@ -152,8 +155,8 @@ def _check_codes(alarms: Iterable[AlarmPlace]) -> None:
                        "each alarm needs its own")
 
 
-def _take_doubts(alarm: Alarm, place: Place, messages: Mapping[str, Message]) -> None:
+def _take_doubts(doubts: Iterable[Doubt], place: Place) -> None:
     """What is doubtful in an alarm as a whole; nothing of an attribute in which an error is known already."""
-    for doubt in check.doubts(alarm, messages):
+    for doubt in doubts:
         if not place.is_wrong(doubt.attribute):
             place.note(doubt.attribute, doubt.message, doubt.hint, doubt.severity, text=place.text(doubt.attribute))

@@ -175,7 +175,7 @@ class _Reader:
         elif re.fullmatch(r"\d{1,4}", value) and int(value) < len(definition.words):
             return
         else:
-            hint = f"0 to {len(definition.words) - 1}"
+            hint = f"write 0 to {len(definition.words) - 1};"
         self._changes[attribute.span] = ""
         self._problem(attribute.line, f"{value} is no value of it", f"{hint} its values are {', '.join(definition.words)}".strip(),
                       where=self._owner(attribute), attribute=attribute.name)
@@ -234,6 +234,9 @@ class _Reader:
         lines = self._text.text.split("\n")
         line = int(error.line)
         column = int(error.column)
+        if open_text := self._text.open_text(line):
+            begins, ends = open_text
+            return begins, f"not a valid DBC file: a text that begins here ends in line {ends} only", 'is its closing `"` missing?'
         if line > len(lines):
             return len(lines), "the file ends inside a statement", "is it complete? the closing `;` may be missing"
         found = re.match(r"\w+|.?", lines[line - 1][column - 1:column + 40])

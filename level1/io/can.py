@@ -23,12 +23,13 @@ from typing import Protocol
 from level1.bus_health import BITS_A_FRAME, WINDOW_NS, BusHealth, Report, Traffic
 from level1.event import Send
 from level1.frame import Frame, Row
+from level1.io import socketcan
 from level1.io.config import Bus
 from level1.io.inbox import Inbox
 from level1.io.listening import Listening
 from level1.io.socketcan import BusError, Filter, SocketCan
 
-__all__ = ["BusError", "Interface", "Port", "open_bus"]
+__all__ = ["BusError", "Interface", "Port", "check_bus", "check_name", "open_bus"]
 
 TICK_S = 0.05
 """So often a bus's thread looks after its interface. A loop that has not fetched in between is late."""
@@ -382,6 +383,21 @@ def open_bus(settings: Bus, clock: Callable[[], int], wall: Callable[[], int]) -
         return SocketCan(settings, clock, wall)
     from level1.io.python_can import open_interface  # only where one is used: it costs 15 MB
     return open_interface(settings, clock, wall)
+
+
+def check_name(settings: Bus) -> None:
+    """Raises BusError where there is no interface of that name. Opens nothing: the bus may be elsewhere yet."""
+    if settings.interface != "socketcan":
+        from level1.io.python_can import check
+        check(settings)
+
+
+def check_bus(settings: Bus) -> None:
+    """Raises BusError with what to do where there is no interface of that name, or its SocketCAN interface is missing or down."""
+    if settings.interface == "socketcan":
+        socketcan.check(settings)
+    else:
+        check_name(settings)
 
 
 def reason(error: Exception) -> str:

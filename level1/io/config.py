@@ -240,7 +240,16 @@ def _struct_problems(table: Any, struct: type[msgspec.Struct], where: str) -> It
         if key in table:
             yield from _value_problems(table[key], field, path)
         elif field.required:
-            yield f"{path}: missing"
+            yield f"{path}: missing; add {_example(key, field.type)}"
+
+
+def _example(key: str, kind: Any) -> str:
+    """How a key is written."""
+    if get_origin(kind) is tuple:
+        return f"a [[{key}]] table"
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return f"a [{key}] table"
+    return f"{key} = …" if kind is int else f'{key} = "…"'
 
 
 def _value_problems(value: Any, field: msgspec.structs.FieldInfo, path: str) -> Iterator[str]:

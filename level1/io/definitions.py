@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 
 import dbc
-from level1 import buses
+from level1 import buses, similar
 from level1.catalog import Catalog, DefinitionError, Problem
 
 MEMORY_LIMIT = 900_000_000
@@ -112,7 +112,11 @@ def _reason(error: OSError) -> str:
 
 
 def _shipped_hint(file: str | Path) -> str:
-    return f"shipped are {', '.join(dbc.shipped())}" if Path(file).name == str(file) else "check the path"
+    path = Path(file)
+    beside = sorted(near.name for near in path.parent.glob("*.dbc")) if path.parent.is_dir() else []
+    if path.name != str(file):
+        return similar.hint(path.name, beside) or "check the path"
+    return f"{similar.hint(path.name, [*beside, *dbc.shipped()])} shipped are {', '.join(dbc.shipped())}".strip()
 
 
 def _bindings(found: Mapping[str, str], bus_files: Mapping[int, Sequence[str | Path]]) -> dict[str, tuple[int, ...]]:

@@ -36,6 +36,7 @@ from level1.io.journal_file import (
     cannot_write,
     code,
     is_corrupt,
+    is_full,
     set_aside,
 )
 from level1.io.journal_monitor import PIECES, Gatherer, History, Piece
@@ -210,6 +211,8 @@ class Journal:
             boot = max(previous, file.last_boot()) + 1
             self._boot_file.write(boot)
         except (sqlite3.Error, OSError) as error:
+            if is_full(self.path, error) and (self._give_up_history() or self._ballast.release()):
+                return self._open(new_boot)
             raise cannot_write(self.path, error) from None
         if previous and not existed:
             self._incidents.append(f"journal {self.path} was gone: the events of boots up to {previous} are not in it")
@@ -225,8 +228,8 @@ class Journal:
         try:
             return JournalFile(self.path, self.unit)
         except sqlite3.DatabaseError as error:
-            if code(error) == sqlite3.SQLITE_FULL and (self._give_up_history() or self._ballast.release()):
-                return JournalFile(self.path, self.unit)
+            if is_full(self.path, error) and (self._give_up_history() or self._ballast.release()):
+                return self._connect(boot)
             if not is_corrupt(error):
                 raise
         kept = set_aside(self.path, boot)
@@ -404,7 +407,7 @@ def _locked(path: Path) -> IO[str]:
         file.close()
         raise JournalError(f"journal {path}: in use by process {owner or 'unknown'}; "
                            "stop that `ucs run`, or set another [journal] path") from None
-    file.truncate(0)
-    file.write(str(os.getpid()))
-    file.flush()
+    with suppress(OSError):  # who holds it is a word for people; a full disk has no room for it
+        os.ftruncate(file.fileno(), 0)
+        os.write(file.fileno(), str(os.getpid()).encode())
     return file

@@ -1,6 +1,7 @@
 """The journal's SQLite file: its tables, its versions, what to do when it is corrupt."""
 from __future__ import annotations
 
+import errno
 import json
 import mmap
 import os
@@ -26,6 +27,8 @@ LINE_BEGINS = b'{"unit":"'
 LINE_BYTES = 1100
 """A longer line does not lie on one page."""
 INSERT_COMMAND = "INSERT OR IGNORE INTO command VALUES (?, ?, ?)"
+SHARED_BYTES = 32 << 10
+"""What SQLite's shared memory beside the journal takes at least."""
 KEEP_COMMANDS = 10_000
 """Commands kept at most (about 4 MB); the oldest go."""
 
@@ -276,8 +279,22 @@ def is_corrupt(error: BaseException) -> bool:
     return isinstance(error, CorruptError) or code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
+def is_full(path: Path, error: BaseException) -> bool:
+    """Whether the disk has no room: SQLite calls it an input/output error when it is its shared memory that finds none."""
+    if code(error) != sqlite3.SQLITE_IOERR:
+        return code(error) == sqlite3.SQLITE_FULL or isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    try:
+        disk = os.statvfs(path.parent)
+    except OSError:
+        return False
+    return disk.f_bavail * disk.f_frsize < SHARED_BYTES
+
+
 def cannot_write(path: Path, error: Exception) -> JournalError:
     """The error of a journal that can't be opened for writing."""
+    if is_full(path, error):
+        return JournalError(f"journal {path}: can't be written, the disk is full; "
+                            "delete files on it, or set another [journal] path")
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return JournalError(f"journal {path}: can't be written ({reason}); "
                         f"make {path.parent} a folder that this user may write to, or set another [journal] path")
@@ -285,6 +302,8 @@ def cannot_write(path: Path, error: Exception) -> JournalError:
 
 def unreadable(path: Path, error: Exception) -> JournalError:
     """The error of a journal that can't be read."""
+    if is_full(path, error):
+        return JournalError(f"journal {path}: can't be read, as the disk is full; delete files on it")
     return JournalError(f"journal {path}: can't be read ({error}); `ucs run` sets a corrupt one aside and begins anew")
 
 

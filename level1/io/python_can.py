@@ -195,11 +195,16 @@ class _Sender:
             self._done.set()
 
 
-def open_interface(settings: Bus, clock: Callable[[], int], wall: Callable[[], int]) -> PythonCan:
-    """Open an interface. Raises BusError with what to do."""
+def check(settings: Bus) -> None:
+    """Raises BusError where there is no interface of that name."""
     if settings.interface not in VALID_INTERFACES:
         raise BusError(f'bus {settings.name}: no interface is called "{settings.interface}"'
                        f"{did_you_mean(settings.interface, VALID_INTERFACES)}")
+
+
+def open_interface(settings: Bus, clock: Callable[[], int], wall: Callable[[], int]) -> PythonCan:
+    """Open an interface. Raises BusError with what to do."""
+    check(settings)
     options = dict(settings.options)
     if settings.bitrate is not None:
         options["bitrate"] = settings.bitrate

@@ -66,7 +66,7 @@ def test_recorder_and_health_have_a_bound_and_a_period(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("more", "problem"), [
     ('[recorder]\npath = "traffic"\nmax_mb = 1\n', "recorder.max_mb: 1 is outside 2 to 10000000 megabytes"),
-    ("[recorder]\nmax_mb = 10\n", "recorder.path: missing"),
+    ("[recorder]\nmax_mb = 10\n", 'recorder.path: missing; add path = "…"'),
     ('[health]\nperiod = "2 s"\n', 'health.period: "2 s" is outside 100 ms to 1 s'),
     ('[health]\nperiod = "50 ms"\n', 'health.period: "50 ms" is outside 100 ms to 1 s'),
     ('[health]\nbroadcast = "yes"\n', "health.broadcast: expected true or false, found a text ('yes')"),

@@ -300,6 +300,7 @@ def test_an_attribute_that_looks_like_one_of_ours_is_a_warning() -> None:
     ('BA_ "AlarmCause" BO_ 1616 "wind";', "error", "belongs to signals", "write SG_"),
     ('BA_ "AlarmCode" SG_ 1616 FlameOut 2;', "warning", "is set twice, first in line", "remove one"),
     ('BA_ "AlarmPriority" SG_ 1616 FlameOut "Hihg";', "error", "is no value of it", "did you mean `High`? its values are"),
+    ('BA_ "AlarmPriority" SG_ 1616 FlameOut 7;', "error", "7 is no value of it", "write 0 to 4; its values are Event, Low"),
     ('BA_ "AlarmOnDelay" SG_ 1616 FlameOut "soon";', "error", "is no number", "without quotes"),
 ])
 def test_an_attribute_that_would_be_passed_over_is_told(line: str, severity: str, message: str, hint: str) -> None:
@@ -317,6 +318,20 @@ def test_a_word_of_an_enumeration_may_be_written_out_and_a_number_in_quotes() ->
 def test_half_a_trouble_code_is_told() -> None:
     assert [p.attribute for p in found(alarm_lines(AlarmSpn=100))] == ["AlarmSpn"]
     assert [p.attribute for p in found(alarm_lines(AlarmFmi=4))] == ["AlarmFmi"]
+
+
+def test_a_quote_that_is_missing_is_told_where_its_text_begins() -> None:
+    unclosed = 'BA_ "AlarmCause" SG_ 1616 FlameOut "wind;'
+    (problem,) = found(unclosed, alarm_lines())
+    assert problem.line == line_of(unclosed, unclosed, alarm_lines())
+    assert (problem.message, problem.hint) == (
+        f"not a valid DBC file: a text that begins here ends in line {problem.line + 1} only", 'is its closing `"` missing?')
+
+
+def test_a_message_without_cycle_time_is_doubted_once_where_it_would_look_healthy_for_ever() -> None:
+    problems = found(alarm_lines("EngineSpeed > 100"), alarm_lines("EngineSpeed > 2000 and CMD.Valve == Open", 2, "PressureLow"))
+    assert [(problem.where, problem.severity, problem.message.partition(":")[0], problem.hint) for problem in problems] == [
+        ("ALARMS.FlameOut", "warning", "EEC1 has no cycle time", "set GenMsgCycleTime")]
 
 
 @pytest.mark.parametrize(("first", "second", "circle"), [

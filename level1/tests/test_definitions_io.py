@@ -75,6 +75,14 @@ def test_errors_are_raised_all_at_once(tmp_path: Path, tool: Path) -> None:
     assert messages == ["no such file", "is a folder, not a DBC file", "there is no signal `Flam`", "there is no signal `Presure`"]
 
 
+def test_a_name_that_is_no_file_is_answered_with_one_that_is(tool: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tool.parent)
+    hints = [examine([name]).problems[0].hint for name in
+             ("tol.dbc", str(tool.parent / "tol.dbc"), "flaming_tol.dbc", "x/none.dbc")]
+    assert [hint.partition("?")[0] for hint in hints] == ["did you mean `tool.dbc`"] * 2 + ["did you mean `flaming_tool.dbc`",
+                                                                                           "check the path"]
+
+
 def test_warnings_do_not_prevent_loading(tool: Path) -> None:
     tool.write_text(text(alarm_lines(AlarmOnDelay=50)))
     found = examine([tool])

@@ -356,6 +356,39 @@ FULL_DISK = """
     assert len(read_events(folder / "journal.db", limit=10**6)) == seq - 50 + 1
 """
 
+START_ON_FULL_DISK = """
+    import sys
+    from pathlib import Path
+    from level1.io.journal import Journal, JournalError, Reader, read_events
+    from level1.tests.test_journal import an_event
+    folder = Path(sys.argv[1])
+
+    def fill():
+        with open(folder / "filler", "ab", buffering=0) as file:
+            for size in (4096, 1):
+                try:
+                    while file.write(bytes(size)): pass
+                except OSError:
+                    pass
+
+    with Journal(folder / "journal.db", "tractor-7") as journal:
+        journal.append([an_event(1)], b"stopped")
+    fill()
+    try:
+        Reader(folder / "journal.db")
+    except JournalError as error:
+        print(error)
+    with Journal(folder / "journal.db", "tractor-7") as journal:
+        assert journal.boot == 2 and journal.restored_state() == b"stopped"
+        assert "the reserve for alarms, which is in use" in journal.fault, journal.fault
+        assert journal.append([an_event(1, boot=2)], b"stopped")
+    fill()
+    try:
+        Journal(folder / "new.db", "tractor-7")
+    except JournalError as error:
+        print(error)
+"""
+
 RECOVERY = """
     import sys
     from pathlib import Path
@@ -393,6 +426,14 @@ def on_small_disk(script: str, folder: Path) -> str:
                    "radio; all written once there is room")
 def test_a_full_disk_gives_its_reserve_to_alarms_and_recovers(tmp_path: Path) -> None:
     assert "events wait in memory" in on_small_disk(FULL_DISK, tmp_path / "disk")
+
+
+@pytest.mark.fault("disk full")
+def test_supervision_starts_on_a_full_disk_out_of_its_reserve(tmp_path: Path) -> None:
+    printed = on_small_disk(START_ON_FULL_DISK, tmp_path / "disk").splitlines()
+    assert [line.split(": ", 1)[1] for line in printed] == [
+        "can't be read, as the disk is full; delete files on it",
+        "can't be written, the disk is full; delete files on it, or set another [journal] path"]
 
 
 @pytest.mark.fault("disk full")

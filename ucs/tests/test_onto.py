@@ -147,7 +147,7 @@ def test_definitions_supervise_what_is_played(replay: Run, tmp_path: Path, log: 
     (("--speed", "1"), "ucs: --speed, --interface and --bitrate need the bus to play onto: --bus vcan0\n"),
     (("--onto", "vcan0", "--onto", "vcan1"),
      "ucs: several buses: say which channel goes where, --bus can0=vcan0 --bus can1=vcan1\n"),
-    (("--onto", "a", "--interface", "virtul"), 'ucs: no interface is called "virtul"; did you mean "virtual"?\n'),
+    (("--onto", "a", "--interface", "virtul"), 'ucs: bus a: no interface is called "virtul"; did you mean "virtual"?\n'),
 ])
 def test_what_does_not_fit_together_is_one_line(replay: Run, log: Path, words: tuple[str, ...], told: str) -> None:
     dbc = () if "--onto" in words else ("--dbc", "flaming_tool.dbc")

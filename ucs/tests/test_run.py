@@ -106,6 +106,9 @@ def test_every_obstacle_is_one_line(
         unit: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, code: int, error: str) -> None:
     assert old in UNIT
     unit.write_text(UNIT.replace(old, new))
+    if "/proc/" not in new:
+        assert main(["run", str(unit), "--check"]) == code, "found before anything is opened"
+        assert error in capsys.readouterr().err.splitlines()[0]
     assert main(["run", str(unit)]) == code
     captured = capsys.readouterr()
     assert error in captured.err.splitlines()[0] and "Traceback" not in captured.err and captured.out == ""

@@ -330,8 +330,8 @@ def test_the_log_is_a_candump_file(tmp_path: Path) -> None:
     (["windy.toml", "--duration", "soon"], "--duration: 'soon' should be a duration"),
     (["windy.toml", "--node", "flamr"], 'no node "flamr" in windy.toml; did you mean "flamer"?'),
     (["windy.toml", "--log", "/nonexistent/out.log"], "/nonexistent/out.log: No such file or directory"),
-    (["windy.toml", "--bus", "nosuch0"], "bus nosuch0 can't be opened: "),
-    (["windy.toml", "--interface", "nosuch", "--channel", "1"], "bus nosuch:1 can't be opened: "),
+    (["windy.toml", "--bus", "nosuch0"], "bus nosuch0: th"),
+    (["windy.toml", "--interface", "nosuch", "--channel", "1"], 'bus nosuch:1: no interface is called "nosuch"; known: '),
     (["windy.toml", "--bus", "vcan0", "--channel", "1"], "not both"),
 ])
 def test_what_stands_in_the_way_is_one_line_and_code_2(words: list[str], error: str, capsys: pytest.CaptureFixture[str]) -> None:
