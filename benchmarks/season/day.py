@@ -39,9 +39,11 @@ MOMENT_NS = 15 * S
 OFTEN, OFTEN_S, OF = 3, 600.0, ("PilotFlameTooOften", "PilotFlameOut")
 """The alarm that counts another one."""
 DANGEROUS = (("flamer", "gas_valve stuck open"), ("flamer", "gas_valve leaks"), ("flamer", "flame_sensor stuck on"),
-             ("flamer", "flame_sensor stuck off"), ("mission", "ignores repairs"))
-"""Faults that are a danger of their own, whatever level 1 does."""
-DANGER_NS = 90 * S
+             ("mission", "ignores repairs"))
+"""Faults that are a danger of their own, whatever level 1 does: gas flows that nobody asked for or that a false flame vouches
+for, or someone lights it against the rule. A sensor that sees no flame is none: the valve closes over a flame that burns."""
+DANGER_NS = 25 * S
+"""And so long after them: gas that has flowed is dangerous for 20 s, one flow shows as a hazard after 4.5 s (`flaming_plant`)."""
 EVENING_NS = 60 * S
 """Before the end nobody fills or orders anything any more: an alarm clears some seconds after its cause is gone."""
 MANY = 20
@@ -97,7 +99,7 @@ class _Watched:
         self.missed = False
         number = fault.statement.index or 0
         self.names = [tuple(alarm.format(n=number) for alarm in symptom.alarms) for symptom in row.symptoms]
-        self.explains = {*row.may, *(alarm for names in self.names for alarm in names)}
+        self.explains = {*row.may, *row.sums, *(alarm for names in self.names for alarm in names)}
 
 
 class Day:
@@ -285,8 +287,9 @@ class Day:
             self._wrong.append(f"{event.t:.2f} s: FALSE {alarm} ({broken or 'nothing is broken'}): {event.values}")
 
     def _left_behind(self, alarm: str) -> bool:
-        """Whether it is a symptom, to be seen now, of what was broken before, or comes with one."""
-        return any((alarm in names or alarm in past.row.may) and symptom.truth(self._world, past.fault.statement.index or 0)
+        """Whether it is a symptom, to be seen now, of what was broken before, or sums one up."""
+        return any((alarm in names or alarm in past.row.sums) and symptom.remains
+                   and symptom.truth(self._world, past.fault.statement.index or 0)
                    for past in self._past for names, symptom in zip(past.names, past.row.symptoms, strict=True))
 
     def _end(self, now_ns: int) -> None:

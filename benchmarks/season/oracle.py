@@ -24,28 +24,30 @@ TAIL_S = 30.0
 
 @dataclass(frozen=True)
 class Symptom:
-    """After `within_s` of this one of the alarms must be there. `{n}` stands for the device's number."""
+    """After `within_s` of this one of the alarms must be there. `{n}` stands for the device's number.
+
+    remains: the truth is a state of the machine, which may outlast the fault. Else it only tells whether the fault can be seen
+    while it lasts: one that has ended explains nothing any more, although the machine talks on.
+    """
 
     alarms: tuple[str, ...]
     within_s: float
     truth: Truth
+    remains: bool = True
 
 
 @dataclass(frozen=True)
 class Row:
-    """What is known of a fault."""
+    """What is known of a fault. sums: alarms that sum up its symptoms, as long as one of them can be seen."""
 
     symptoms: tuple[Symptom, ...] = ()
     may: tuple[str, ...] = ()
     tail_s: float = TAIL_S
+    sums: tuple[str, ...] = ()
 
 
-def _symptom(alarms: str, within_s: float, truth: Truth) -> Symptom:
-    return Symptom(tuple(alarms.split()), within_s, truth)
-
-
-def _always(w: World, n: int) -> bool:
-    return True
+def _symptom(alarms: str, within_s: float, truth: Truth, *, remains: bool = True) -> Symptom:
+    return Symptom(tuple(alarms.split()), within_s, truth, remains)
 
 
 # --- flaming tool -----------------------------------------------------------------------------------------------------------
@@ -95,7 +97,7 @@ FLAMER_QUIET = _symptom("FlamerSilent", 1.4, lambda w, n: not w.flamer.sends)
 TOLD_EMPTY = _symptom("BottleEmpty", 4.5, lambda w, n: w.flamer.talks and w.flamer.plant.bottle.bar * w.flamer.bottle_told < 0.7)
 TOLD_LOW = _symptom("BottleLow", 12.0, lambda w, n: w.flamer.talks
                     and w.flamer.plant.bottle.level_percent * w.flamer.bottle_told < 14)
-FLAMER_MISCOUNTS = _symptom("FlamerFrozen", 2.0, lambda w, n: w.flamer.talks)
+FLAMER_MISCOUNTS = _symptom("FlamerFrozen", 2.0, lambda w, n: w.flamer.talks, remains=False)
 FLAMER_STANDS = _symptom("FlamerFrozen", 2.0, lambda w, n: w.flamer.sends and not w.flamer.talks)
 
 OUT = ("PilotFlameOut", "PilotFlameTooOften")
@@ -210,16 +212,16 @@ TANK_CRITICAL = _symptom("MainTankCritical", 7.0, lambda w, n: w.sprayer.talks a
 DIS_CRITICAL = _symptom("DisTankCritical", 7.0, lambda w, n: w.sprayer.talks and w.sprayer.plant.dis_l < 0.45)
 SPRAYER_QUIET = _symptom("SprayerSilent", 1.4, lambda w, n: not w.sprayer.sends)
 SPRAYER_STANDS = _symptom("SprayerFrozen", 2.0, lambda w, n: w.sprayer.sends and not w.sprayer.talks)
-SPRAYER_GARBLED = _symptom("SprayerDataCorrupt", 1.0, lambda w, n: w.sprayer.talks)
+SPRAYER_GARBLED = _symptom("SprayerDataCorrupt", 1.0, lambda w, n: w.sprayer.talks, remains=False)
 SPRAYER_COMMANDS_LOST = _symptom("SprayerCommandsLost", 0.9, lambda w, n: w.sprayer.is_believed
                                  and w.sprayer.control == "CommandsLost")
 SECTIONS = ("ChangeNozzlesFailure",)
 LINES = ("MainFlowNotAdjusted", "SetDisFlowFailure")
 
 SPRAYER: Mapping[str, Row] = {
-    "valve stuck closed": Row((WRONG_SECTION,), SECTIONS),
-    "valve stuck open": Row((WRONG_SECTION, STAYS_OPEN), (*SECTIONS, "SprayingStartStopFailure")),
-    "valve slow": Row((WRONG_SECTION,), (*SECTIONS, "SectionStaysOpen")),
+    "valve stuck closed": Row((WRONG_SECTION,), sums=SECTIONS),
+    "valve stuck open": Row((WRONG_SECTION, STAYS_OPEN), ("SprayingStartStopFailure",), sums=SECTIONS),
+    "valve slow": Row((WRONG_SECTION,), ("SectionStaysOpen",), sums=SECTIONS),
     "refuses start": Row((WRONG_SPRAYING,)),
     "refuses stop": Row((WRONG_SPRAYING,), ("OpenCloseBoomFailure", "BoomOpeningNotAdjusted")),
     "main_flow refuses": Row((MAIN_NOT_TAKEN,), LINES),
@@ -288,9 +290,9 @@ PTO_NOT_ON = _symptom("PtoNotSet", 6.9, lambda w, n: _movable(w) and w.tractor.e
 PTO_NOT_OFF = _symptom("PtoNotUnset", 7.9, lambda w, n: w.tractor.talks and w.tractor.controller != "Manual"
                        and w.command("VEHICLE_PTO_CMD").get("PtoWanted") == "Off" and w.tractor.pto.state != "Off")
 IMPLEMENT_WRONG = _symptom("ImplementSetUnsetFailure", 5.9, _implement_wrong)
-OIL_SENSOR = _symptom("OilPressureSensorFault", 3.4, lambda w, n: w.tractor.talks)
-WARNING_LAMP = _symptom("EngineWarningLamp", 3.4, lambda w, n: w.tractor.talks)
-CODE = _symptom("TroubleCode", 2.4, lambda w, n: w.tractor.talks)
+OIL_SENSOR = _symptom("OilPressureSensorFault", 3.4, lambda w, n: w.tractor.talks, remains=False)
+WARNING_LAMP = _symptom("EngineWarningLamp", 3.4, lambda w, n: w.tractor.talks, remains=False)
+CODE = _symptom("TroubleCode", 2.4, lambda w, n: w.tractor.talks, remains=False)
 HOT = _symptom("CoolantHot", 13.0, lambda w, n: _runs(w) and w.tractor.engine.coolant_c > 106.5)
 TOO_HOT = _symptom("CoolantCritical", 8.0, lambda w, n: _runs(w) and w.tractor.engine.coolant_c > 113.5)
 NO_CHARGE = _symptom("ChargingVoltageLow", 33.0, lambda w, n: _runs(w) and w.tractor.engine.volts < 12.34)
@@ -302,7 +304,7 @@ STOPPED = _symptom("UnitStopped", 0.9, lambda w, n: w.tractor.talks and w.tracto
                    and w.tractor.reason == "Switch")
 VEHICLE_QUIET = _symptom("VehicleSilent", 1.4, lambda w, n: not w.tractor.sends)
 VEHICLE_STANDS = _symptom("VehicleFrozen", 2.0, lambda w, n: w.tractor.sends and not w.tractor.talks)
-VEHICLE_MISCOUNTS = _symptom("VehicleFrozen", 2.0, lambda w, n: w.tractor.talks)
+VEHICLE_MISCOUNTS = _symptom("VehicleFrozen", 2.0, lambda w, n: w.tractor.talks, remains=False)
 VEHICLE_COMMANDS_LOST = _symptom("VehicleCommandsLost", 0.9, lambda w, n: w.tractor.talks
                                  and w.tractor.reason == "CommandsLost")
 
@@ -367,14 +369,15 @@ AIRBLAST_EMPTY = _symptom("AirblastTankCritical", 5.0, lambda w, n: _tells(w) an
 AIRBLAST_LOW = _symptom("AirblastTankLow", 12.0, lambda w, n: _tells(w) and w.airblast.plant.level_percent < 14)
 AIRBLAST_TOLD_EMPTY = _symptom("AirblastTankCritical", 5.0, lambda w, n: _tells(w) and _airblast_told_percent(w) < 4)
 AIRBLAST_TOLD_LOW = _symptom("AirblastTankLow", 12.0, lambda w, n: _tells(w) and _airblast_told_percent(w) < 14)
-AIRBLAST_MISCOUNTS = _symptom("AirblastFrozen", 2.2, lambda w, n: _tells(w))
+AIRBLAST_MISCOUNTS = _symptom("AirblastFrozen", 2.2, lambda w, n: _tells(w), remains=False)
 NO_FLOW = _symptom("NoMainFlow", 3.6, lambda w, n: _vouches(w) and w.airblast.works and _airblast_told_percent(w) >= 6
                    and w.airblast.plant.flow_l_min < 1.8)
 """A tank that is told to be empty, which AirblastTankCritical says, is reason enough for no flow."""
 WRONG_AIRBLAST = _symptom("AirblastStartStopFailure", 3.7, _wrong_airblast)
 AIRBLAST_EMERGENCY = _symptom("DeviceEmergency", 0.5, lambda w, n: w.airblast.talks and w.airblast.nmt_state != STOPPED_STATE
                               and any(w.airblast.errors.values()))
-AIRBLAST_BABBLES = _symptom("DeviceEmergency", 0.5, lambda w, n: w.airblast.talks and w.airblast.nmt_state != STOPPED_STATE)
+AIRBLAST_BABBLES = _symptom("DeviceEmergency", 0.5, lambda w, n: w.airblast.talks and w.airblast.nmt_state != STOPPED_STATE,
+                            remains=False)
 AIRBLAST_NO_HEARTBEAT = _symptom("AirblastHeartbeatLost", 3.0, lambda w, n: _tells(w) and not w.airblast.beats)
 AIRBLAST_STOPPED = _symptom("AirblastNotOperational", 3.0, lambda w, n: w.airblast.talks
                             and w.airblast.nmt_state == STOPPED_STATE)
@@ -416,7 +419,7 @@ ULTRASONIC_EMERGENCY = _symptom("DeviceEmergency", 0.5, lambda w, n: w.ultrasoni
                                 and any(w.ultrasonic.errors.values()))
 """An emergency is sent once: one that came up while the device was silent, or stopped, nobody has heard."""
 ULTRASONIC_BABBLES = _symptom("DeviceEmergency", 0.5, lambda w, n: w.ultrasonic.talks
-                              and w.ultrasonic.nmt_state != STOPPED_STATE)
+                              and w.ultrasonic.nmt_state != STOPPED_STATE, remains=False)
 ULTRASONIC_NO_HEARTBEAT = _symptom("UltrasonicHeartbeatLost", 4.5, lambda w, n: _senses(w) and not w.ultrasonic.beats)
 ULTRASONIC_STOPPED = _symptom("UltrasonicNotOperational", 4.0, lambda w, n: w.ultrasonic.talks
                               and w.ultrasonic.nmt_state == STOPPED_STATE)
@@ -481,26 +484,30 @@ TABLE: Mapping[str, Mapping[str, Row]] = {
 
 NATURAL: Mapping[str, Callable[[World], bool]] = {
     "PilotFlameOut": lambda w: w.flamer.works and not w.flamer.plant.flame,
-    "BottleLow": lambda w: w.flamer.plant.bottle.level_percent < 16,
-    "BottleEmpty": lambda w: w.flamer.plant.bottle.bar < 0.9,
-    "BoomMoving": lambda w: True,
-    "MainTankCritical": lambda w: w.sprayer.plant.tank.level_l(w.now_ns) < 15,
-    "DisTankCritical": lambda w: w.sprayer.plant.dis_l < 1,
-    "MainTankMismatch": lambda w: tank_differs_l(w) > 8,
+    "BottleLow": lambda w: w.flamer.plant.bottle.level_percent < 15.3,
+    "BottleEmpty": lambda w: w.flamer.plant.bottle.bar < 0.85,
+    "BoomMoving": lambda w: w.sprayer.boom.state in ("Opening", "Closing"),
+    "MainTankCritical": lambda w: w.sprayer.plant.tank.level_l(w.now_ns) < 12.2,
+    "DisTankCritical": lambda w: w.sprayer.plant.dis_l < 0.6,
+    "MainTankMismatch": lambda w: tank_differs_l(w) > 10,
     "MissionFinished": lambda w: w.tractor.mission == "Finished",
     "UnitStopped": lambda w: w.tractor.controller == "Stopped",
     "UnitNotMoving": lambda w: w.tractor.reason == "NotMoving" or not w.tractor.engine.running,
-    "FuelLow": lambda w: w.tractor.engine.fuel_percent < 15,
-    "AirblastTankLow": lambda w: w.airblast.plant.level_percent < 20,
-    "AirblastTankCritical": lambda w: w.airblast.plant.level_percent < 10,
+    "FuelLow": lambda w: w.tractor.engine.fuel_percent < 10.5,
+    "AirblastTankLow": lambda w: w.airblast.plant.level_percent < 15.6,
+    "AirblastTankCritical": lambda w: w.airblast.plant.level_percent < 5.6,
 }
-"""Alarm -> whether it is true now without any fault: wind, what was used up, what was ordered. It may also stand at the end."""
+"""Alarm -> whether it is true now without any fault: wind, what was used up, what was ordered. Limits are those at which it is
+raised, and what sloshes (1 L either way and half a second old, or 0.4 %) or is rounded. A difference between
+meter and level is what an earlier leak has left."""
 
 LINGERS: Mapping[str, Callable[[World], bool]] = {
     "BottleLow": lambda w: w.flamer.plant.bottle.level_percent < 20.5,
     "BottleEmpty": lambda w: w.flamer.plant.bottle.bar < 1.55 or w.flamer.plant.bottle.level_percent < 5.5,
     "MainTankCritical": lambda w: w.sprayer.plant.tank.level_l(w.now_ns) < 17,
+    "DisTankCritical": lambda w: w.sprayer.plant.dis_l < 1.05,
     "MainTankMismatch": lambda w: tank_differs_l(w) > 6,
+    "FuelLow": lambda w: w.tractor.engine.fuel_percent < 15.5,
     "AirblastTankLow": lambda w: w.airblast.plant.level_percent < 20.8,
     "AirblastTankCritical": lambda w: w.airblast.plant.level_percent < 10.8,
 }
