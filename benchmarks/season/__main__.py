@@ -9,7 +9,6 @@ made no sense, a plant came into danger by itself, or memory grew.
 from __future__ import annotations
 
 import hashlib
-import os
 import signal
 import sys
 import time
@@ -18,65 +17,16 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-import msgspec
-
 from benchmarks.season.day import DayResult, Tally
+from benchmarks.season.kept import ROOT, Kept, cache_folder
 from benchmarks.season.plan import MACHINES, S
 from benchmarks.season.runner import run
 
-ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reliability.md"
 BEGIN, END = "<!-- counts: python -m benchmarks.season --write -->", "<!-- end of the season's counts -->"
-CODE = ("level1", "firmware_py", "dbc", "benchmarks/season", "ucs/simulated_unit.py")
-"""What a day's outcome depends on."""
 DAY_S, SHORTEST_DAY_S = 3600, 300
 GROWTH_KB = 16 * 1024
 """More memory than this, once a process has met every machine, is a leak."""
-
-# --- finished days ----------------------------------------------------------------------------------------------------------
-
-
-class Kept:
-    """Finished days of one season by one state of the code, a file each."""
-
-    def __init__(self, folder: Path, seed: int, length_ns: int):
-        self.folder = folder / f"{seed}-{length_ns // S}-{code_hash()}"
-
-    def load(self) -> list[DayResult]:
-        """All of them; a damaged file counts as none."""
-        found = []
-        for path in sorted(self.folder.glob("*.json")):
-            try:
-                found.append(msgspec.json.decode(path.read_bytes(), type=DayResult))
-            except (OSError, msgspec.DecodeError):
-                continue
-        return found
-
-    def store(self, result: DayResult) -> None:
-        """Keep one."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        part = self.folder / f"{result.number:05d}.part"
-        part.write_bytes(msgspec.json.encode(result))
-        part.replace(part.with_suffix(".json"))
-
-
-def code_hash() -> str:
-    """Names the state of the code and the definitions."""
-    digest = hashlib.sha256()
-    for place in CODE:
-        path = ROOT / place
-        files = sorted(path.rglob("*")) if path.is_dir() else [path]
-        for file in files:
-            if file.suffix in (".py", ".dbc", ".eds", ".lark") and "tests" not in file.parts:
-                digest.update(file.relative_to(ROOT).as_posix().encode() + file.read_bytes())
-    return digest.hexdigest()[:12]
-
-
-def cache_folder() -> Path:
-    """Where finished days are kept."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return Path(base) / "tractor-ucs" / "season-days"
-
 
 # --- what came out ----------------------------------------------------------------------------------------------------------
 
@@ -211,19 +161,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if length_ns < SHORTEST_DAY_S * S or args.hours <= 0 or args.jobs < 1:
         parser.error(f"a day needs {SHORTEST_DAY_S} s at least, the season more than 0 h, and one process")
     count = max(1, round(args.hours * 3600 / args.day))
-    kept = Kept(args.cache / (args.machine or ""), args.seed, length_ns)
-    results = {result.number: result for result in ([] if args.fresh else kept.load()) if result.number < count}
-    jobs = [] if args.report else [(args.seed, number, length_ns, args.machine) for number in range(count) if number not in results]
+    kept = Kept(args.cache)
+    days = {number: (args.seed, number, length_ns, args.machine) for number in range(count)}
+    results = {result.number: result for result in ([] if args.fresh else kept.load([*days.values()]))}
+    jobs = [] if args.report else [job for number, job in days.items() if number not in results]
     if results:
         print(f"{len(results)} day{'s were' if len(results) > 1 else ' was'} finished before", flush=True)
     progress = Progress(count, len(results))
     try:
         for result in run(jobs, min(args.jobs, max(1, len(jobs)))):
             results[result.number] = result
-            kept.store(result)
+            kept.store(days[result.number], result)
             progress.told(result)
     except KeyboardInterrupt:
-        print(f"\nstopped; the same command goes on from here: {len(results)} of {count} days are kept in {kept.folder}")
+        print(f"\nstopped; the same command goes on from here: {len(results)} of {count} days are kept in {args.cache}")
     report = Report(results.values())
     for line in report.wrong if args.report else report.wrong[-1:] * (report.growth_kb > GROWTH_KB):
         print(line)

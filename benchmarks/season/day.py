@@ -12,7 +12,8 @@ from random import Random
 import msgspec
 
 from benchmarks.season.episodes import Episodes
-from benchmarks.season.oracle import LINGERS, NATURAL, TABLE, Row, Symptom
+from benchmarks.season.oracle import LINGERS, NATURAL, TABLE
+from benchmarks.season.oracle.table import Row, Symptom
 from benchmarks.season.people import ROUND_NS, People
 from benchmarks.season.plan import Fault, Plan, S
 from benchmarks.season.world import World

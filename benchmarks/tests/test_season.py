@@ -8,8 +8,9 @@ import msgspec
 import pytest
 
 from benchmarks.season import day as day_module
-from benchmarks.season.__main__ import Kept, Report, main
+from benchmarks.season.__main__ import Report, main
 from benchmarks.season.day import Day, DayResult
+from benchmarks.season.kept import Kept, code_hash
 from benchmarks.season.oracle import TABLE
 from benchmarks.season.plan import MACHINES, NO_FAULTS, Fault, Plan, S, plan
 from firmware_py.codec import Codec
@@ -75,9 +76,30 @@ def test_finished_days_count_when_it_goes_on(tmp_path: Path, capsys: pytest.Capt
     first = capsys.readouterr().out.splitlines()[-1]
     assert main([*arguments, "--report"]) == 0
     assert capsys.readouterr().out.splitlines() == ["1 day was finished before", first]
-    (kept,) = Kept(tmp_path / "flaming tool", 1, 360 * S).load()
+    (kept,) = Kept(tmp_path).load([(1, 0, 360 * S, "flaming tool")])
     table = Report([kept]).tables()
     assert f"| flaming tool | 0.1 | {sum(tally.injected for tally in kept.tallies.values())} |" in table
+
+
+def test_a_day_counts_until_something_that_it_ran_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def files_of(change: str) -> dict[str, str]:
+        code_hash.cache_clear()
+        read = Path.read_bytes
+        monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + (b" " if path.as_posix().endswith(change) else b""))
+        try:
+            return {machine: code_hash(machine) for machine in MACHINES}
+        finally:
+            monkeypatch.undo()
+            code_hash.cache_clear()
+    before = files_of("nothing")
+
+    def again(change: str) -> set[str]:
+        after = files_of(change)
+        return {machine for machine in MACHINES if after[machine] != before[machine]}
+    assert again("level1/repair.py") == again("dbc/ucs.dbc") == again("firmware_py/node.py") == set(MACHINES)
+    assert again("firmware_py/sprayer_plant.py") == again("oracle/sprayer_boom.py") == {"sprayer boom", "tractor with boom"}
+    assert again("dbc/vehicle.dbc") == {"tractor", "tractor with boom"}
+    assert again("level1/io/live.py") == set()
 
 
 def test_memory_that_grows_is_wrong() -> None:
