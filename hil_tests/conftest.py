@@ -10,17 +10,21 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
+from itertools import count
 from pathlib import Path
 from typing import IO, Literal, NamedTuple
 
 import pytest
 
 from hil_tests.vcan_run import INTERFACES
+from level1.decode import encode
+from level1.io.definitions import load
 
 ROOT = Path(__file__).parents[1]
 UCS = (sys.executable, "-m", "ucs")
 STOP_S = 10.0
 """A program must end so long after SIGTERM."""
+ALARM_S = 20.0
 
 
 class Line(NamedTuple):
@@ -171,6 +175,19 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     if report.failed:
         report.sections += [(f"{one.name} (process {one.pid})", one.transcript) for one in item.stash.get(RUNNING, [])]
     return report
+
+
+def lose_the_flame(run: Process, send: Callable[[int, bytes], object]) -> None:
+    """What a flaming tool says whose pilot flame is out, until the unit has told it."""
+    status = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
+    end_s = time.monotonic() + ALARM_S
+    for times in count():
+        if any(re.search("PilotFlameOut +raised", line) for line in run.out):
+            break
+        assert time.monotonic() < end_s, "no alarm"
+        send(status.can_id, encode(status, {"Flaming": 1, "PilotFlame": 0, "AliveCounter": times % 4}, None))
+        time.sleep(0.1)
+    run.expect("PilotFlameOut +raised")
 
 
 @pytest.fixture

@@ -18,10 +18,11 @@ from typing import Any
 
 import pytest
 
-from hil_tests.conftest import ROOT, Process
+from hil_tests.conftest import ROOT, Process, lose_the_flame
 from level1.decode import encode, raw_of
 from level1.frame import ERROR, EXTENDED
 from level1.io.definitions import load
+from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
@@ -29,20 +30,7 @@ START_S = 30.0
 IN_TIME_S = 1.0
 """The alarm of what befalls a bus."""
 OVER_S = 5.0
-UNIT = """
-[unit]
-name = "tractor-7"
-[[bus]]
-name = "tractor"
-channel = "vcan1"
-dbc = ["ucs.dbc"]
-[[bus]]
-name = "implement"
-channel = "vcan0"
-dbc = ["flaming_tool.dbc"]
-[journal]
-path = "journal.db"
-"""
+UNIT = unit_toml("flaming_tool.dbc", more='[[bus]]\nname = "tractor"\nchannel = "vcan1"\ndbc = ["ucs.dbc"]')
 BABBLER = 0x18FE_F1AA
 ROUNDS = 100
 SAMPLES = 150
@@ -119,16 +107,6 @@ def events(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in written.splitlines()]
 
 
-def lose_the_flame() -> None:
-    """What a flaming tool says for half a second whose pilot flame is out."""
-    message = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
-    payload = encode(message, {"Flaming": 1, "PilotFlame": 0}, None)
-    with Wire() as wire:
-        for _ in range(6):
-            wire.send(message.can_id, payload)
-            time.sleep(0.1)
-
-
 @pytest.mark.covers("CanBusDown", "raised", "cleared")
 def test_a_link_that_goes_down_is_an_alarm_until_it_is_up(run: Process, plug: Plug) -> None:
     plug.down()
@@ -143,8 +121,8 @@ def test_an_adapter_that_is_pulled_out_is_an_alarm_until_it_is_back(run: Process
     time.sleep(1)
     plug.in_()
     run.expect("CanBusDown +cleared", OVER_S)
-    lose_the_flame()
-    run.expect("PilotFlameOut +raised", OVER_S)
+    with Wire() as wire:
+        lose_the_flame(run, wire.send)
 
 
 @pytest.mark.parametrize(("classes", "controller", "alarm"), [(0x40, 0, "CanBusOff"), (0x4, 0x20, "CanBusErrors")])
@@ -228,8 +206,8 @@ def test_plugs_pulled_a_hundred_times_leave_a_supervisor_that_works_and_a_journa
         plugged_ns.append(time.monotonic_ns())
         time.sleep(chance.uniform(0.0, 0.2))
     time.sleep(1)
-    lose_the_flame()
-    run.expect("PilotFlameOut +raised", 2 * OVER_S)
+    with Wire() as wire:
+        lose_the_flame(run, wire.send)
     assert run.stop() == 0
     told = [event for event in events(tmp_path) if event["alarm"] == "CanBusDown"]
     assert [event["event"] for event in told] == ["raised", "cleared"] * (len(told) // 2)

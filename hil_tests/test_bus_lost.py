@@ -2,30 +2,19 @@
 from __future__ import annotations
 
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import can
 import pytest
 
-from hil_tests.conftest import Process
-from level1.decode import encode
+from hil_tests.conftest import Process, lose_the_flame
 from level1.io.definitions import load
+from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
 START_S = 30.0
-UNIT = """
-[unit]
-name = "tractor-7"
-[[bus]]
-name = "implement"
-channel = "{channel}"
-dbc = ["flaming_tool.dbc"]
-[journal]
-path = "journal.db"
-"""
 
 
 @pytest.fixture
@@ -34,7 +23,7 @@ def unit(tmp_path: Path) -> Callable[[str], Path]:
 
     def write(channel: str) -> Path:
         file = tmp_path / f"{channel}.toml"
-        file.write_text(UNIT.format(channel=channel))
+        file.write_text(unit_toml("flaming_tool.dbc", channel=channel))
         return file
 
     return write
@@ -62,16 +51,6 @@ def remake() -> Iterator[Callable[[], None]]:
         toggle()
 
 
-def lose_the_flame() -> None:
-    """What a flaming tool says for half a second whose pilot flame is out."""
-    message = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
-    payload = encode(message, {"Flaming": 1, "PilotFlame": 0}, None)
-    with can.Bus(channel="vcan0", interface="socketcan") as bus:
-        for _ in range(6):
-            bus.send(can.Message(arbitration_id=message.can_id, is_extended_id=False, data=payload))
-            time.sleep(0.1)
-
-
 @pytest.mark.parametrize("away", ["down", "deleted"])
 def test_a_bus_that_comes_back_is_heard_again_without_a_restart(
         away: str, process: Callable[..., Process], unit: Callable[[str], Path], set_link: Callable[[str, bool], None],
@@ -88,8 +67,8 @@ def test_a_bus_that_comes_back_is_heard_again_without_a_restart(
     else:
         remake()
     run.expect("bus implement: back after", 5)
-    lose_the_flame()
-    run.expect("PilotFlameOut +raised", 5)
+    with can.Bus(channel="vcan0", interface="socketcan") as bus:
+        lose_the_flame(run, lambda can_id, data: bus.send(can.Message(arbitration_id=can_id, is_extended_id=False, data=data)))
     assert run.stop() == 0
 
 

@@ -17,6 +17,7 @@ import pytest
 
 import dbc
 from hil_tests.conftest import ROOT, Process
+from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
@@ -25,13 +26,8 @@ SILENT_S = 1.75
 """Three and a half heartbeats of 500 ms."""
 SLOW_S = 5.0
 """A guest without CPU of its own may be late by so much."""
-UNIT = """
-[unit]
-name = "tractor-7"
-[[bus]]
-name = "implement"
-channel = "vcan0"
-dbc = ["airblast_sprayer.dbc", "ucs.dbc"]
+ARMED = ["Ultrasonic3NotWorking", "UltrasonicNotOperational", "AirblastNotOperational"]
+UNIT = unit_toml("airblast_sprayer.dbc", "ucs.dbc", armed=ARMED, more="""
 [[bus.canopen]]
 node = 42
 eds = "airblast_sprayer.eds"
@@ -39,11 +35,7 @@ history = true
 [[bus.canopen]]
 node = 43
 eds = "ultrasonic_sensors.eds"
-[repairs]
-armed = ["Ultrasonic3NotWorking", "UltrasonicNotOperational", "AirblastNotOperational"]
-[journal]
-path = "journal.db"
-"""
+""")
 SCENARIO = """
 duration = "10 min"
 orders = ["at 3 s: spraying on"]
@@ -205,7 +197,7 @@ def test_a_guarded_device_is_asked_and_told_by_the_name_of_its_data_sheet_when_i
         process: Start, tmp_path: Path) -> None:
     (tmp_path / "valve.eds").write_text("[DeviceInfo]\nProductName=Old valve\n[100C]\nDefaultValue=100\n[100D]\nDefaultValue=8\n")
     (tmp_path / "unit.toml").write_text(
-        UNIT.replace("[repairs]", f'[[bus.canopen]]\nnode = {GUARDED}\neds = "valve.eds"\n[repairs]'))
+        f'{UNIT}[[bus.canopen]]\nnode = {GUARDED}\neds = "valve.eds"\n')
     started = process("run", "unit.toml")
     started.expect("; supervising$", START_S)
     device = Guarded()

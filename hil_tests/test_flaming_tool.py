@@ -18,6 +18,7 @@ from hil_tests.conftest import ROOT, RUNNING, UCS, Process
 from hil_tests.recorder import Recorder
 from level1.catalog import LOCKED_OUT, NORMAL, REPAIRING
 from level1.io.definitions import load
+from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
@@ -26,21 +27,6 @@ START_S = 30.0
 PURGE_S, ATTEMPT_S = 30.0, 40.0
 MARGIN = 1.2
 """A guest without CPU of its own may be late by so much of a time."""
-UNIT = """
-[unit]
-name = "{name}"
-fleet = "north-farm"
-[[bus]]
-name = "implement"
-channel = "{channel}"
-dbc = ["flaming_tool.dbc"]
-[repairs]
-armed = ["PilotFlameOut"]
-[journal]
-path = "{name}.db"
-[bridge]
-broker = "mqtt://{broker}"
-"""
 SCENARIO = """
 seed = 1
 duration = "5 min"
@@ -61,7 +47,9 @@ class Tractor:
     def __init__(self, field: Field, name: str, channel: str, faults: str):
         self.field, self.name = field, name
         self.recorder = Recorder(channel, field.messages)
-        (field.folder / f"{name}.toml").write_text(UNIT.format(name=name, channel=channel, broker=BROKER))
+        (field.folder / f"{name}.toml").write_text(unit_toml(
+            "flaming_tool.dbc", name=name, journal=f"{name}.db", armed=["PilotFlameOut"], channel=channel,
+            more=f'[bridge]\nbroker = "mqtt://{BROKER}"'))
         (field.folder / f"{name}.scenario.toml").write_text(SCENARIO.format(faults=faults))
         self.run = field.start("run", f"{name}.toml")
         self.bridge = field.start("bridge", f"{name}.toml")

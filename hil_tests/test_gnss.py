@@ -16,23 +16,11 @@ from level1.decode import Scale, raw_of
 from level1.io.definitions import load
 from level1.io.journal import read_events
 from level1.tests.plug import FIX, Plug, sentence
+from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
 START_S, WAIT_S = 30.0, 20.0
-UNIT = """
-[unit]
-name = "tractor-7"
-[[bus]]
-name = "tractor"
-channel = "vcan0"
-dbc = ["ucs.dbc"]
-[gnss]
-port = "{port}"
-broadcast = true
-[journal]
-path = "journal.db"
-"""
 NO_FIX = "GPGGA,,,,,,0,,,,M,,M,,"
 
 
@@ -77,7 +65,7 @@ def talker(tmp_path: Path) -> Iterator[Talker]:
 def run(tmp_path: Path, talker: Talker, process: Callable[..., Process]) -> Process:
     """`ucs run`, supervising."""
     file = tmp_path / "unit.toml"
-    file.write_text(UNIT.format(port=talker.plug.path))
+    file.write_text(unit_toml("ucs.dbc", more=f'[gnss]\nport = "{talker.plug.path}"\nbroadcast = true'))
     started = process("run", file)
     started.expect("; supervising$", START_S)
     return started

@@ -10,20 +10,11 @@ from typing import Any
 import can
 import pytest
 
+from ucs.tests.units import unit_toml
+
 pytestmark = pytest.mark.vcan
 
-UNIT = """
-[unit]
-name = "tractor-5"
-fleet = "north-farm"
-[[bus]]
-name = "tractor"
-channel = "vcan0"
-dbc = ["ucs.dbc", "isobus_tractor.dbc"]
-j1939 = 128
-[journal]
-path = "journal.db"
-"""
+UNIT = unit_toml("ucs.dbc", "isobus_tractor.dbc", more="j1939 = 128")
 ENGINE, UCS = 0x00, 0x80
 DM1 = 65226
 ADDRESS_CLAIM = 0x18EEFF00

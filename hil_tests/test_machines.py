@@ -22,6 +22,7 @@ from level1.catalog import ACTIVE, NORMAL, REPAIRING, Catalog
 from level1.event import Event
 from level1.io.definitions import load
 from level1.io.journal import read_events
+from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
@@ -30,22 +31,6 @@ LENGTH_S = 25.0
 RUNS, STOOD_STILL_S = 3, 0.25
 LATE_S = 25.0
 """Programs start slowly in a guest without CPU of its own."""
-UNIT = """
-[unit]
-name = "{name}"
-[[bus]]
-name = "implement"
-channel = "{channel}"
-dbc = {files}
-[repairs]
-armed = {armed}
-[journal]
-path = "{name}.db"
-"""
-GNSS = """
-[gnss]
-port = "gnss"
-"""
 URGENT = -15
 """Nice value of programs that have begun."""
 REPAIRED = ("raised", "repair_started", "repaired", "cleared")
@@ -125,8 +110,8 @@ class Unit:
         self.events: list[Event] = []
         armed = [fault.alarm for fault in plan.faults if fault.message]
         (folder / f"{plan.name}.toml").write_text(
-            UNIT.format(name=plan.name, channel=plan.channel, files=list(plan.files), armed=armed).replace("'", '"')
-            + (GNSS if plan is ORCHARD else ""))
+            unit_toml(*plan.files, name=plan.name, journal=f"{plan.name}.db", armed=armed, channel=plan.channel,
+                      more='[gnss]\nport = "gnss"' if plan is ORCHARD else ""))
         faults = [fault.fault for fault in plan.faults if fault.fault]
         (folder / f"{plan.name}.scenario.toml").write_text(
             f'duration = "{LENGTH_S} s"\norders = {list(plan.orders)}\nfaults = {faults}\n{plan.nodes}'.replace("'", '"'))

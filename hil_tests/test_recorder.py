@@ -12,25 +12,12 @@ from hil_tests.conftest import Process
 from level1.io.definitions import load
 from level1.io.journal import read_events
 from level1.io.replay import Log
+from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
 START_S, WAIT_S = 30.0, 20.0
-UNIT = """
-[unit]
-name = "tractor-7"
-[[bus]]
-name = "tractor"
-channel = "vcan0"
-dbc = ["ucs.dbc"]
-[repairs]
-armed = ["TrafficLogFailed"]
-[recorder]
-path = "traffic"
-max_mb = 10
-[journal]
-path = "journal.db"
-"""
+UNIT = unit_toml("ucs.dbc", armed=["TrafficLogFailed"], more='[recorder]\npath = "traffic"\nmax_mb = 10')
 
 
 @pytest.fixture

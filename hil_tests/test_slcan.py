@@ -9,27 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.conftest import Process
-from level1.decode import encode
-from level1.io.definitions import load
+from hil_tests.conftest import Process, lose_the_flame
 from level1.tests.lawicel import Adapter
+from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
 START_S, IN_TIME_S, BACK_S = 30.0, 1.0, 10.0
-STATUS = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
-UNIT = """
-[unit]
-name = "tractor-7"
-[[bus]]
-name = "implement"
-channel = "slcan0"
-dbc = ["ucs.dbc", "flaming_tool.dbc"]
-[repairs]
-armed = ["PilotFlameOut"]
-[journal]
-path = "journal.db"
-"""
 
 
 class Line:
@@ -69,7 +55,8 @@ def line(tmp_path: Path) -> Iterator[Line]:
 
 def test_an_adapter_by_the_kernels_slcan_is_supervised_pulled_out_and_found_again(
         process: Callable[..., Process], line: Line, tmp_path: Path) -> None:
-    (tmp_path / "unit.toml").write_text(UNIT)
+    (tmp_path / "unit.toml").write_text(
+        unit_toml("ucs.dbc", "flaming_tool.dbc", armed=["PilotFlameOut"], channel="slcan0"))
     run = process("run", "unit.toml")
     run.expect("; supervising$", START_S)
     line.detach()
@@ -77,10 +64,7 @@ def test_an_adapter_by_the_kernels_slcan_is_supervised_pulled_out_and_found_agai
     line.adapter.plug()
     line.attach()
     run.expect("CanBusDown +cleared", BACK_S)
-    for counter in range(10):
-        line.adapter.hear(STATUS.can_id, encode(STATUS, {"Flaming": 1, "PilotFlame": 0, "AliveCounter": counter % 4}, None))
-        time.sleep(0.1)
-    run.expect("PilotFlameOut +raised", BACK_S)
+    lose_the_flame(run, line.adapter.hear)
     run.expect("PilotFlameOut +repair started", BACK_S)
     end = time.monotonic() + BACK_S
     while not any(sent.startswith("t110") for sent in line.adapter.sent):

@@ -82,12 +82,12 @@ class Uplink:
             for instruct in self._local.receive():
                 self._inbox.order(msgspec.structs.replace(instruct.order, origin="local"))
             while self._link.refusals:
-                self._inbox.report(_refused(self._link.refusals.popleft(), self._clock()))
+                self._inbox.report(refused(self._link.refusals.popleft(), self._clock()))
             if not readable:
                 self._journal.prune(delivered_upto(delivered_path(Path(self._journal.path))))
 
 
-def _refused(refusal: Refusal, now_ns: int) -> tuple[Report, Report]:
+def refused(refusal: Refusal, now_ns: int) -> tuple[Report, Report]:
     """Raised and cleared at once: a command that was refused is an occasion, not a state."""
     key = f"{refusal.reason}/{refusal.key}"
     detail = {"Reason": refusal.reason, "Key": refusal.key, "Count": refusal.count}

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from bridge.tests.brokers import NATS, free_port
 from level1.event import Event, seconds
+from ucs.tests.units import unit_toml
 
 ROOT = Path(__file__).parents[2]
 
@@ -41,19 +42,6 @@ UNIT = """
             print(journal.boot, seq, flush=True)
             time.sleep(pause_s)
 """
-CONFIG = """
-    [unit]
-    name = "tractor-7"
-    fleet = "farm"
-    [[bus]]
-    name = "implement"
-    channel = "vcan0"
-    dbc = ["flaming_tool.dbc"]
-    [journal]
-    path = "journal.db"
-    [bridge]
-    broker = "mqtt://127.0.0.1:{port}"
-"""
 
 
 class Chain:
@@ -62,7 +50,8 @@ class Chain:
     def __init__(self, folder: Path, pause_s: float = 0.02, nats: str = ""):
         self.folder = folder
         port = free_port()
-        (folder / "unit.toml").write_text(textwrap.dedent(CONFIG.format(port=port)))
+        (folder / "unit.toml").write_text(
+            unit_toml("flaming_tool.dbc", fleet="farm", more=f'[bridge]\nbroker = "mqtt://127.0.0.1:{port}"'))
         python, ucs = [sys.executable, "-c"], [sys.executable, "-m", "ucs"]
         self.commands = {
             "broker": self._nats(nats, port) if nats else [*python, textwrap.dedent(BROKER), str(port)],

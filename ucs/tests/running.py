@@ -11,25 +11,14 @@ from pathlib import Path
 import dbc
 from ucs.main import main
 from ucs.standing import RunStanding, ask_run
+from ucs.tests.units import unit_toml
 
 WAIT_S = 60.0
 
 
-def unit_toml(channel: str) -> str:
+def flaming_unit(channel: str) -> str:
     """A unit with the flaming tool on a virtual bus, its pilot flame lit again."""
-    return f"""
-[unit]
-name = "tractor-7"
-[[bus]]
-name = "implement"
-interface = "virtual"
-channel = "{channel}"
-dbc = ["flaming_tool.dbc"]
-[repairs]
-armed = ["PilotFlameOut"]
-[journal]
-path = "journal.db"
-"""
+    return unit_toml("flaming_tool.dbc", armed=["PilotFlameOut"], interface="virtual", channel=channel)
 
 
 def patient_tool(folder: Path) -> None:

@@ -17,16 +17,9 @@ import pytest
 from level1.event import Commanded, Event, Monitor, SentFrame, decode, decode_commanded, decode_monitor, seconds
 from level1.io.journal import Journal
 from ucs.main import main
+from ucs.tests.units import unit_toml
 
 ROOT = Path(__file__).parents[2]
-CONFIG = """
-[unit]
-name = "tractor-7"
-[[bus]]
-name = "implement"
-channel = "vcan0"
-dbc = ["flaming_tool.dbc"]
-"""
 
 
 def an_event(seq: int, alarm: str, event: str, utc: str | None = None, boot: int = 1, **more: object) -> Event:
@@ -46,7 +39,7 @@ EVENTS = [
 
 @pytest.fixture
 def unit(tmp_path: Path) -> Iterator[Path]:
-    (tmp_path / "unit.toml").write_text(CONFIG + '[journal]\npath = "journal.db"\n')
+    (tmp_path / "unit.toml").write_text(unit_toml("flaming_tool.dbc"))
     with Journal(tmp_path / "journal.db", "tractor-7") as journal:
         journal.append(EVENTS, b"")
         yield tmp_path / "unit.toml"
@@ -172,7 +165,7 @@ def test_following_shows_events_as_they_come(tmp_path: Path) -> None:
     (["unit.toml", "--last", "0"], "--last 0: write a number from 1"),
 ])
 def test_mistakes_are_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], args: list[str], told: str) -> None:
-    (tmp_path / "unit.toml").write_text(CONFIG)
+    (tmp_path / "unit.toml").write_text(unit_toml("flaming_tool.dbc", journal=""))
     assert main(["journal", str(tmp_path / args[0]), *args[1:]]) == 2
     error = capsys.readouterr().err
     assert told in error and error.count("\n") == 1

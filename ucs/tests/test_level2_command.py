@@ -17,17 +17,10 @@ from bridge.session import BridgeThread, Settings
 from level1.event import Monitor, Result, seconds
 from level1.io.journal import Journal
 from ucs.main import main
+from ucs.tests.units import unit_toml
 
 ROOT = Path(__file__).parents[2]
-CONFIG = """
-[unit]
-name = "tractor-7"
-fleet = "farm"
-[[bus]]
-name = "implement"
-channel = "vcan0"
-dbc = ["flaming_tool.dbc"]
-"""
+CONFIG = unit_toml("flaming_tool.dbc", fleet="farm", journal="")
 
 
 @pytest.mark.parametrize(("args", "told"), [

@@ -29,7 +29,7 @@ from ucs.monitor import Listening, Monitor, Unit, pressed
 from ucs.pages import PAGES, Sight, View, screen, whole_page
 from ucs.standing import AlarmStanding, BusStanding, RepairStanding
 from ucs.terminal import harmless, keys_of, painted, plain
-from ucs.tests.running import WAIT_S, awaited, beside_run, patient_tool, unit_toml
+from ucs.tests.running import WAIT_S, awaited, beside_run, flaming_unit, patient_tool
 from ucs.watching import Heard, Watching, silent
 
 MS = 1_000_000
@@ -125,7 +125,7 @@ def test_alarms_as_they_look_from_here(catalog: Catalog) -> None:
 
 def test_attached_it_shows_the_repair_of_the_run_beside_the_signals_and_sends_nothing(tmp_path: Path) -> None:
     unit = tmp_path / "unit.toml"
-    unit.write_text(unit_toml("test_monitor"))
+    unit.write_text(flaming_unit("test_monitor"))
     patient_tool(tmp_path)
     payload = encode(load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"], {"Flaming": 1, "PilotFlame": 0, "Safeguard": 4}, None)
     shown: list[str] = []

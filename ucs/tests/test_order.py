@@ -15,14 +15,14 @@ from level1.io.live import encode_state
 from level1.memory import AlarmMemory, State
 from ucs.main import main
 from ucs.order import give
-from ucs.tests.running import WAIT_S, awaited, beside_run, unit_toml
+from ucs.tests.running import WAIT_S, awaited, beside_run, flaming_unit
 
 
 @pytest.fixture
 def unit(tmp_path: Path) -> Path:
     """A unit that was stopped from above, with an alarm locked out."""
     file = tmp_path / "unit.toml"
-    file.write_text(unit_toml("test_order"))
+    file.write_text(flaming_unit("test_order"))
     raised = Event("tractor-7", 1, 1, Decimal("1.000000000"), None, False, "PilotFlameOut", 3101, "High", "raised", 1, 0, {}, "out")
     memory = AlarmMemory("PilotFlameOut", 3, 1, False, 3, (), ())
     with Journal(tmp_path / "journal.db", "tractor-7") as writing:

@@ -24,9 +24,9 @@ from level1.memory import State
 from level1.supervisor import Supervisor
 from ucs.main import main
 from ucs.run import restored
-from ucs.tests.running import WAIT_S, beside_run, patient_tool, unit_toml
+from ucs.tests.running import WAIT_S, beside_run, flaming_unit, patient_tool
 
-UNIT = unit_toml("test_run")
+UNIT = flaming_unit("test_run")
 
 
 @pytest.fixture

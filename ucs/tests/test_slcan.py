@@ -14,22 +14,8 @@ from level1.io.definitions import load
 from level1.io.journal import read_events
 from level1.tests.lawicel import Adapter
 from ucs.tests.running import WAIT_S, beside_run, patient_tool
+from ucs.tests.units import unit_toml
 
-UNIT = """
-[unit]
-name = "tractor-7"
-[[bus]]
-name = "implement"
-interface = "slcan"
-channel = "{channel}"
-bitrate = 250000
-dbc = ["ucs.dbc", "flaming_tool.dbc"]
-options = {{ sleep_after_open = 0.0 }}
-[repairs]
-armed = ["PilotFlameOut"]
-[journal]
-path = "journal.db"
-"""
 IN_TIME_S = 1.0
 MESSAGES = load(["ucs.dbc", "flaming_tool.dbc"]).messages
 STATUS, UCS_ALARMS = MESSAGES["FLAMER_STATUS"], MESSAGES["UCS_ALARMS"]
@@ -39,7 +25,9 @@ ALARMS, COMMAND = "t650", "t110"
 @pytest.fixture
 def adapter(tmp_path: Path) -> Iterator[Adapter]:
     one = Adapter(tmp_path / "ttyCAN")
-    (tmp_path / "unit.toml").write_text(UNIT.format(channel=one.path))
+    (tmp_path / "unit.toml").write_text(unit_toml(
+        "ucs.dbc", "flaming_tool.dbc", armed=["PilotFlameOut"], interface="slcan", channel=str(one.path),
+        more="bitrate = 250000\noptions = { sleep_after_open = 0.0 }"))
     patient_tool(tmp_path)
     yield one
     one.stop()

@@ -24,9 +24,9 @@ from ucs.attendant import Attendant
 from ucs.main import main
 from ucs.standing import AlarmStanding, BridgeStanding, BusStanding, RepairStanding, RunStanding, ask_run
 from ucs.status import CRITICAL, OK, UNKNOWN, WARNING, JournalStanding, Limits, Picture, alarm_line, first_line, judge, page
-from ucs.tests.running import awaited, beside_run, patient_tool, unit_toml
+from ucs.tests.running import awaited, beside_run, flaming_unit, patient_tool
 
-UNIT = unit_toml("test_status")
+UNIT = flaming_unit("test_status")
 BRIDGE = '[bridge]\nbroker = "mqtt://127.0.0.1:1"\n'
 BUS = BusStanding("implement", "socketcan", "can0", "BusActive", received=100, sent=3, quiet_s=0.1, load_percent=12.0)
 RUN = RunStanding("t", "f", "1.0", pid=1, boot=5, seq=9, uptime_s=100.0, turn_age_s=0.1, lateness_s=0.002, mode="running",
