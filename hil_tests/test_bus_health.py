@@ -18,18 +18,17 @@ from typing import Any
 
 import pytest
 
-from hil_tests.conftest import ROOT, Process, lose_the_flame
+from hil_tests.conftest import ROOT, SOON_S, START_S, Process, lose_the_flame
 from level1.decode import encode, raw_of
 from level1.frame import ERROR, EXTENDED
 from level1.io.definitions import load
+from ucs.tests.proof import proves
 from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
-START_S = 30.0
 IN_TIME_S = 1.0
 """The alarm of what befalls a bus."""
-OVER_S = 5.0
 UNIT = unit_toml("flaming_tool.dbc", more='[[bus]]\nname = "tractor"\nchannel = "vcan1"\ndbc = ["ucs.dbc"]')
 BABBLER = 0x18FE_F1AA
 ROUNDS = 100
@@ -112,7 +111,7 @@ def test_a_link_that_goes_down_is_an_alarm_until_it_is_up(run: Process, plug: Pl
     plug.down()
     run.expect("CanBusDown +raised", IN_TIME_S)
     plug.in_()
-    run.expect("CanBusDown +cleared", OVER_S)
+    run.expect("CanBusDown +cleared", SOON_S)
 
 
 def test_an_adapter_that_is_pulled_out_is_an_alarm_until_it_is_back(run: Process, plug: Plug) -> None:
@@ -120,29 +119,33 @@ def test_an_adapter_that_is_pulled_out_is_an_alarm_until_it_is_back(run: Process
     run.expect("CanBusDown +raised", IN_TIME_S)
     time.sleep(1)
     plug.in_()
-    run.expect("CanBusDown +cleared", OVER_S)
+    run.expect("CanBusDown +cleared", SOON_S)
     with Wire() as wire:
         lose_the_flame(run, wire.send)
 
 
-@pytest.mark.parametrize(("classes", "controller", "alarm"), [(0x40, 0, "CanBusOff"), (0x4, 0x20, "CanBusErrors")])
+@pytest.mark.parametrize(("classes", "controller", "alarm"), [
+    proves({alarm: ("raised", "cleared")}, classes, controller, alarm)
+    for classes, controller, alarm in ((0x40, 0, "CanBusOff"), (0x4, 0x20, "CanBusErrors"))])
 def test_a_controller_that_gives_up_is_an_alarm_until_it_is_well(
         run: Process, plug: Plug, classes: int, controller: int, alarm: str) -> None:
     with Wire() as wire:
         wire.error(classes, controller)
         run.expect(f"{alarm} +raised", IN_TIME_S)
         wire.error(0x104, 0x40)  # restarted, error-active
-        run.expect(f"{alarm} +cleared", OVER_S)
+        run.expect(f"{alarm} +cleared", SOON_S)
 
 
+@pytest.mark.covers("CanBusOff", "raised", "cleared")
 def test_after_bus_off_the_first_frame_proves_that_the_bus_is_back(run: Process, plug: Plug) -> None:
     with Wire() as wire:
         wire.error(0x40)
         run.expect("CanBusOff +raised", IN_TIME_S)
         wire.send(0x210, bytes(8))
-        run.expect("CanBusOff +cleared", OVER_S)
+        run.expect("CanBusOff +cleared", SOON_S)
 
 
+@pytest.mark.covers("Babbling", "raised", "cleared")
 @pytest.mark.parametrize("can_id", [EXTENDED | BABBLER, 0x210], ids=["nobody asks for", "of a message"])
 def test_an_identifier_that_babbles_is_named(run: Process, plug: Plug, can_id: int) -> None:
     with Wire() as wire:
@@ -160,7 +163,7 @@ def test_an_identifier_that_babbles_is_named(run: Process, plug: Plug, can_id: i
         finally:
             stop.set()
             thread.join()
-    run.expect("Babbling +cleared", OVER_S)
+    run.expect("Babbling +cleared", SOON_S)
 
 
 def test_babble_that_the_kernels_gateway_forwards_is_told_of_both_buses(run: Process, plug: Plug) -> None:
@@ -182,9 +185,10 @@ def test_babble_that_the_kernels_gateway_forwards_is_told_of_both_buses(run: Pro
         subprocess.run(["cangw", "-F"], check=True)
     assert heard == {"tractor", "implement"}
     for _ in range(2):
-        run.expect("Babbling +cleared", OVER_S)
+        run.expect("Babbling +cleared", SOON_S)
 
 
+@pytest.mark.covers("FramesLost", "raised")
 def test_frames_the_kernel_had_to_drop_are_told(run: Process, plug: Plug) -> None:
     os.kill(run.pid, signal.SIGSTOP)  # not the group: `ip` and others of the test go on
     with Wire() as wire:

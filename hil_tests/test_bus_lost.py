@@ -8,13 +8,11 @@ from pathlib import Path
 import can
 import pytest
 
-from hil_tests.conftest import Process, lose_the_flame
+from hil_tests.conftest import SOON_S, START_S, Process, lose_the_flame
 from level1.io.definitions import load
 from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
-
-START_S = 30.0
 
 
 @pytest.fixture
@@ -61,12 +59,12 @@ def test_a_bus_that_comes_back_is_heard_again_without_a_restart(
         set_link("vcan0", False)
     else:
         remake()
-    run.expect("bus implement: lost .*trying again", 5)
+    run.expect("bus implement: lost .*trying again", SOON_S)
     if away == "down":
         set_link("vcan0", True)
     else:
         remake()
-    run.expect("bus implement: back after", 5)
+    run.expect("bus implement: back after", SOON_S)
     with can.Bus(channel="vcan0", interface="socketcan") as bus:
         lose_the_flame(run, lambda can_id, data: bus.send(can.Message(arbitration_id=can_id, is_extended_id=False, data=data)))
     assert run.stop() == 0
@@ -90,12 +88,12 @@ def test_nodes_on_a_bus_that_goes_away_survive_and_go_on_when_it_is_back(
     node = process("simulate", "healthy.toml", "--bus", "vcan0", "--duration", "1 min")
     node.expect("flaming on", START_S)
     set_link("vcan0", False) if away == "down" else remake()
-    node.expect("bus vcan0 is lost .*the nodes live on and try again", 5)
+    node.expect("bus vcan0 is lost .*the nodes live on and try again", SOON_S)
     set_link("vcan0", True) if away == "down" else remake()
-    node.expect("bus vcan0 is back", 5)
+    node.expect("bus vcan0 is back", SOON_S)
     message = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
     with can.Bus(channel="vcan0", interface="socketcan", can_filters=[{"can_id": message.can_id, "can_mask": 0x7FF}]) as bus:
-        assert bus.recv(5) is not None, "it sends again"
+        assert bus.recv(SOON_S) is not None, "it sends again"
     assert node.stop() == 0
 
 

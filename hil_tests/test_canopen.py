@@ -16,16 +16,13 @@ import canopen
 import pytest
 
 import dbc
-from hil_tests.conftest import ROOT, Process
+from hil_tests.conftest import ROOT, SOON_S, START_S, Process
 from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
-START_S = 40.0
 SILENT_S = 1.75
 """Three and a half heartbeats of 500 ms."""
-SLOW_S = 5.0
-"""A guest without CPU of its own may be late by so much."""
 ARMED = ["Ultrasonic3NotWorking", "UltrasonicNotOperational", "AirblastNotOperational"]
 UNIT = unit_toml("airblast_sprayer.dbc", "ucs.dbc", armed=ARMED, more="""
 [[bus.canopen]]
@@ -108,13 +105,13 @@ def test_a_dead_sensor_is_reset_by_nmt_and_verified_by_its_heartbeat(run: Proces
     sensors = simulate("sensors", faults='"at 12 s: sensors.sensor[3] dead"')
     sprayer.expect("spraying on", START_S)
     sensors.expect("sensor 3 has failed", START_S)
-    run.expect("DeviceEmergency +raised.*sensor 3 gives no echo", SLOW_S)
-    run.expect("Ultrasonic3NotWorking +raised", SLOW_S)
-    run.expect("Ultrasonic3NotWorking +repair started", SLOW_S)
-    sensors.expect("is reset by NMT", SLOW_S)
-    sensors.expect("starts anew", SLOW_S)
-    run.expect("Ultrasonic3NotWorking +repaired", SLOW_S)
-    run.expect("Ultrasonic3NotWorking +cleared", SLOW_S)
+    run.expect("DeviceEmergency +raised.*sensor 3 gives no echo", SOON_S)
+    run.expect("Ultrasonic3NotWorking +raised", SOON_S)
+    run.expect("Ultrasonic3NotWorking +repair started", SOON_S)
+    sensors.expect("is reset by NMT", SOON_S)
+    sensors.expect("starts anew", SOON_S)
+    run.expect("Ultrasonic3NotWorking +repaired", SOON_S)
+    run.expect("Ultrasonic3NotWorking +cleared", SOON_S)
     assert not any("Silent" in line for line in run.out), "a reset that was ordered is no silence"
 
 
@@ -130,8 +127,8 @@ def test_a_device_that_dies_is_told_as_silent_and_cleared_when_it_is_back(
         assert message is not None, "operational"
     time.sleep(1)
     sensors.kill()
-    run.expect("DeviceSilent +raised.*Node 43, Device Ultrasonic sensors", SILENT_S + SLOW_S)
-    run.expect("UltrasonicSilent +raised", 4 + SLOW_S)
+    run.expect("DeviceSilent +raised.*Node 43, Device Ultrasonic sensors", SILENT_S + SOON_S)
+    run.expect("UltrasonicSilent +raised", 4 + SOON_S)
     simulate("sensors")
     run.expect("DeviceSilent +cleared", START_S)
     assert run.stop() == 0
@@ -145,7 +142,7 @@ def test_a_device_that_dies_is_told_as_silent_and_cleared_when_it_is_back(
 def test_level_1_starts_devices_that_nobody_started(run: Process, simulate: Callable[..., Process], peer: Peer) -> None:
     simulate("sensors")
     run.expect("UltrasonicNotOperational +raised", START_S)
-    run.expect("UltrasonicNotOperational +repaired", SLOW_S)
+    run.expect("UltrasonicNotOperational +repaired", SOON_S)
 
 
 @pytest.mark.covers("DeviceEmergency", "raised", "cleared")
@@ -156,10 +153,10 @@ def test_emergencies_and_error_history_of_a_node_by_the_package(run: Process, pe
     device.set_data(0x1003, 0, b"\2")
     time.sleep(1)
     device.emcy.send(0x3120, 0x05, b"\1\2\3\4\5")
-    run.expect("DeviceEmergency +raised.*Device Air-blast sprayer.*supply voltage too low", SLOW_S)
+    run.expect("DeviceEmergency +raised.*Device Air-blast sprayer.*supply voltage too low", SOON_S)
     time.sleep(3)
     device.emcy.reset()
-    run.expect("DeviceEmergency +cleared", SLOW_S)
+    run.expect("DeviceEmergency +cleared", SOON_S)
     assert run.stop() == 0
     raised, cleared = journal(tmp_path, "DeviceEmergency")
     assert raised["values"]["ErrorRegister"] == "generic, voltage"
@@ -206,12 +203,12 @@ def test_a_guarded_device_is_asked_and_told_by_the_name_of_its_data_sheet_when_i
             time.sleep(0.1)
     finally:
         device.stop()
-    started.expect(f"DeviceSilent +raised.*Node {GUARDED}, Device Old valve", SLOW_S)
+    started.expect(f"DeviceSilent +raised.*Node {GUARDED}, Device Old valve", SOON_S)
     device = Guarded()
     try:
-        started.expect("DeviceSilent +cleared", SLOW_S)
+        started.expect("DeviceSilent +cleared", SOON_S)
         device.alternates = False
-        started.expect("DeviceSilent +raised", SLOW_S)
+        started.expect("DeviceSilent +raised", SOON_S)
     finally:
         device.stop()
     assert started.stop() == 0
@@ -224,11 +221,11 @@ def test_a_node_nobody_configured_is_learned_and_missed(run: Process, peer: Peer
     device = peer.device(UNKNOWN)
     time.sleep(3)
     device.emcy.send(0x8130, 0x11)
-    run.expect("DeviceEmergency +raised.*Node 7,.*a heartbeat or life guard it waits for is missing", SLOW_S)
+    run.expect("DeviceEmergency +raised.*Node 7,.*a heartbeat or life guard it waits for is missing", SOON_S)
     device.nmt.stop_heartbeat()
-    run.expect("DeviceSilent +raised.*Node 7,", SILENT_S + SLOW_S)
+    run.expect("DeviceSilent +raised.*Node 7,", SILENT_S + SOON_S)
     device.nmt.start_heartbeat(500)
-    run.expect("DeviceSilent +cleared", SLOW_S)
+    run.expect("DeviceSilent +cleared", SOON_S)
     device.nmt.stop_heartbeat()
 
 
@@ -236,12 +233,12 @@ def test_the_simulated_devices_are_understood_by_the_package(simulate: Callable[
     simulate("sprayer", "sensors", "mission").expect("spraying on", START_S)
     sensors = peer.network.add_node(SENSORS, str(dbc.path("ultrasonic_sensors.eds")))
     sprayer = peer.network.add_node(SPRAYER, str(dbc.path("airblast_sprayer.eds")))
-    assert sensors.nmt.wait_for_heartbeat(5) == "OPERATIONAL"
+    assert sensors.nmt.wait_for_heartbeat(SOON_S) == "OPERATIONAL"
     assert sprayer.sdo[0x1008].raw == "Air-blast sprayer"
     assert sprayer.sdo[0x1018][2].raw == 42
     sprayer.tpdo.read()
-    assert sprayer.tpdo[2].wait_for_reception(5) is not None
+    assert sprayer.tpdo[2].wait_for_reception(SOON_S) is not None
     assert 150 < sprayer.tpdo[2]["Main line.Tank level"].raw <= 200, "half per cents"
     sensors.nmt.state = "RESET"
-    sensors.nmt.wait_for_bootup(5)
-    assert sensors.nmt.wait_for_heartbeat(5) == "OPERATIONAL", "the mission controller has started it"
+    sensors.nmt.wait_for_bootup(SOON_S)
+    assert sensors.nmt.wait_for_heartbeat(SOON_S) == "OPERATIONAL", "the mission controller has started it"

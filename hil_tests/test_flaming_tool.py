@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.conftest import ROOT, RUNNING, UCS, Process
+from hil_tests.conftest import ROOT, RUNNING, SOON_S, START_S, UCS, Process
 from hil_tests.recorder import Recorder
 from level1.catalog import LOCKED_OUT, NORMAL, REPAIRING
 from level1.io.definitions import load
@@ -23,7 +23,6 @@ from ucs.tests.units import unit_toml
 pytestmark = pytest.mark.vcan
 
 BROKER = "127.0.0.1:18830"
-START_S = 30.0
 PURGE_S, ATTEMPT_S = 30.0, 40.0
 MARGIN = 1.2
 """A guest without CPU of its own may be late by so much of a time."""
@@ -117,14 +116,14 @@ def field(running: Field, request: pytest.FixtureRequest) -> Field:
 def test_a_flame_blown_out_is_lit_again_and_level_2_hears_it_all(field: Field) -> None:
     level2, run = field.level2, field.windy.run
     run.expect("PilotFlameOut +raised", START_S)
-    run.expect("PilotFlameOut +repair started", 5)
+    run.expect("PilotFlameOut +repair started", SOON_S)
     run.expect("PilotFlameOut +repaired", ATTEMPT_S * MARGIN)
-    run.expect("PilotFlameOut +cleared", 5)
+    run.expect("PilotFlameOut +cleared", SOON_S)
     for word in ("raised", "repair_started 1", "repaired 1", "cleared"):
-        level2.expect(f"windy PilotFlameOut {word}", 5)
-    field.windy.node.expect("pilot flame out: blown out", 1)
-    field.windy.node.expect("purged", 1)
-    field.windy.node.expect("pilot flame burns", 1)
+        level2.expect(f"windy PilotFlameOut {word}", SOON_S)
+    field.windy.node.expect("pilot flame out: blown out", SOON_S)
+    field.windy.node.expect("purged", SOON_S)
+    field.windy.node.expect("pilot flame burns", SOON_S)
 
 
 def test_the_valve_closes_within_a_second_and_no_gas_flows_before_the_purge(field: Field) -> None:
@@ -142,7 +141,7 @@ def test_the_valve_closes_within_a_second_and_no_gas_flows_before_the_purge(fiel
 
 def test_the_bus_shows_the_alarms_life_and_who_commands(field: Field) -> None:
     assert field.windy.recorder.changes("FLAMER_ALARMS", "PilotFlameOut") == [NORMAL, 1, REPAIRING, 1, NORMAL]
-    field.windy.node.expect("commands again: working", 5)
+    field.windy.node.expect("commands again: working", SOON_S)
 
 
 @pytest.mark.covers("PilotFlameOut", "raised", "repair_started", "repair_failed", "locked_out")
@@ -151,8 +150,8 @@ def test_with_a_dead_igniter_three_attempts_end_in_a_lock_out_at_level_2(field: 
     for attempt in (1, 2, 3):
         run.expect(f"PilotFlameOut +repair started +attempt {attempt}", ATTEMPT_S * MARGIN)
         run.expect(f"PilotFlameOut +repair failed +attempt {attempt}", ATTEMPT_S * MARGIN)
-    run.expect("PilotFlameOut +locked out", 5)
-    level2.expect("broken PilotFlameOut locked_out", 5)
+    run.expect("PilotFlameOut +locked out", SOON_S)
+    level2.expect("broken PilotFlameOut locked_out", SOON_S)
     assert sum("broken PilotFlameOut repair_failed" in line for line in level2.out) == 3
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import can
 import pytest
 
+from hil_tests.conftest import SOON_S, START_S
 from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
@@ -29,7 +30,7 @@ def dm1(*spns: int) -> bytes:
 def supervisor(process: Any, tmp_path: Path) -> Any:
     (tmp_path / "unit.toml").write_text(UNIT)
     running = process("run", "unit.toml", cwd=tmp_path)
-    running.expect("supervising", within_s=30)
+    running.expect("supervising", START_S)
     return running
 
 
@@ -53,7 +54,7 @@ def test_the_kernels_broadcast_in_packets_is_understood(supervisor: Any, engine:
 
 def test_the_kernels_session_with_flow_control_is_granted_and_acknowledged(supervisor: Any, engine: socket.socket) -> None:
     time.sleep(0.5)
-    engine.settimeout(5)
+    engine.settimeout(SOON_S)
     engine.sendto(dm1(*range(100, 140)), ("vcan0", socket.J1939_NO_NAME, DM1, UCS))
     for spn in (100, 139):
         supervisor.expect(f"TroubleCode +raised .*SPN {spn}")
@@ -63,7 +64,7 @@ def test_the_address_is_claimed_defended_and_given_up_to_a_stronger_name(process
     (tmp_path / "unit.toml").write_text(UNIT)
     with can.Bus("vcan0", interface="socketcan") as bus:
         running = process("run", "unit.toml", cwd=tmp_path)
-        running.expect("supervising", within_s=30)
+        running.expect("supervising", START_S)
         name = heard(bus, ADDRESS_CLAIM | UCS)
         bus.send(can.Message(arbitration_id=ADDRESS_CLAIM | UCS, data=b"\xff" * 8))
         assert heard(bus, ADDRESS_CLAIM | UCS) == name
@@ -88,7 +89,7 @@ def test_the_kernels_own_claim_with_a_stronger_name_takes_the_address(supervisor
 
 def heard(bus: can.BusABC, can_id: int) -> bytes:
     """The payload of the next frame with this identifier."""
-    end = time.monotonic() + 10
+    end = time.monotonic() + SOON_S
     while time.monotonic() < end:
         message = bus.recv(1)
         if message is not None and message.arbitration_id == can_id:

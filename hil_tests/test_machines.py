@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from hil_tests.conftest import ROOT, RUNNING, UCS, Process
+from hil_tests.conftest import ROOT, RUNNING, START_S, UCS, Process
 from hil_tests.recorder import Recorder
 from level1.catalog import ACTIVE, NORMAL, REPAIRING, Catalog
 from level1.event import Event
@@ -26,7 +26,6 @@ from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
-START_S = 40.0
 LENGTH_S = 25.0
 RUNS, STOOD_STILL_S = 3, 0.25
 LATE_S = 25.0

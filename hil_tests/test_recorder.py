@@ -8,7 +8,7 @@ from pathlib import Path
 import can
 import pytest
 
-from hil_tests.conftest import Process
+from hil_tests.conftest import SOON_S, START_S, Process
 from level1.io.definitions import load
 from level1.io.journal import read_events
 from level1.io.replay import Log
@@ -16,7 +16,6 @@ from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
-START_S, WAIT_S = 30.0, 20.0
 UNIT = unit_toml("ucs.dbc", armed=["TrafficLogFailed"], more='[recorder]\npath = "traffic"\nmax_mb = 10')
 
 
@@ -35,7 +34,7 @@ def test_the_state_of_the_computer_is_on_the_bus_every_second(run: Process) -> N
     stamps: list[float] = []
     with can.Bus(channel="vcan0", interface="socketcan") as bus:
         while len(stamps) < 4:
-            heard = bus.recv(WAIT_S)
+            heard = bus.recv(SOON_S)
             assert heard is not None
             if heard.arbitration_id == message.can_id:
                 stamps.append(heard.timestamp)
@@ -72,14 +71,14 @@ def test_a_recorder_that_can_not_write_is_an_alarm_and_begins_anew_when_it_can(r
     (tmp_path / "traffic").rename(tmp_path / "away")
     (tmp_path / "traffic").write_text("not a folder")
     chatter(6)
-    run.expect("traffic recorder .*traffic: not recorded .*trying again", WAIT_S)
-    run.expect("TrafficLogFailed +raised", WAIT_S)
-    run.expect("TrafficLogFailed +repair started", WAIT_S)
+    run.expect("traffic recorder .*traffic: not recorded .*trying again", SOON_S)
+    run.expect("TrafficLogFailed +raised", SOON_S)
+    run.expect("TrafficLogFailed +repair started", SOON_S)
     (tmp_path / "traffic").unlink()
     chatter(8)
-    run.expect("traffic recorder .*traffic: works again", WAIT_S)
-    run.expect("TrafficLogFailed +repaired", WAIT_S)
-    run.expect("TrafficLogFailed +cleared", WAIT_S)
+    run.expect("traffic recorder .*traffic: works again", SOON_S)
+    run.expect("TrafficLogFailed +repaired", SOON_S)
+    run.expect("TrafficLogFailed +cleared", SOON_S)
     assert run.stop() == 0
     life = [event.event for event in read_events(tmp_path / "journal.db") if event.alarm == "TrafficLogFailed"]
     assert (life[:2], life[-2:]) == (["raised", "repair_started"], ["repaired", "cleared"])

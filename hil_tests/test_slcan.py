@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.conftest import Process, lose_the_flame
+from hil_tests.conftest import SOON_S, START_S, Process, lose_the_flame
 from level1.tests.lawicel import Adapter
 from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
 
-START_S, IN_TIME_S, BACK_S = 30.0, 1.0, 10.0
+IN_TIME_S = 1.0
 
 
 class Line:
@@ -29,7 +29,7 @@ class Line:
     def attach(self) -> None:
         self._daemon = subprocess.Popen(["slcand", "-F", "-o", "-s5", os.path.realpath(self.adapter.path), "slcan0"],
                                         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        end = time.monotonic() + BACK_S
+        end = time.monotonic() + SOON_S
         while not Path("/sys/class/net/slcan0").exists():
             assert time.monotonic() < end, "the kernel makes no interface"
             time.sleep(0.05)
@@ -63,10 +63,10 @@ def test_an_adapter_by_the_kernels_slcan_is_supervised_pulled_out_and_found_agai
     run.expect("CanBusDown +raised", IN_TIME_S)
     line.adapter.plug()
     line.attach()
-    run.expect("CanBusDown +cleared", BACK_S)
+    run.expect("CanBusDown +cleared", SOON_S)
     lose_the_flame(run, line.adapter.hear)
-    run.expect("PilotFlameOut +repair started", BACK_S)
-    end = time.monotonic() + BACK_S
+    run.expect("PilotFlameOut +repair started", SOON_S)
+    end = time.monotonic() + SOON_S
     while not any(sent.startswith("t110") for sent in line.adapter.sent):
         assert time.monotonic() < end, "no command reaches the adapter"
         time.sleep(0.05)

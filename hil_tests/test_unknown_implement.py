@@ -8,6 +8,7 @@ from typing import Any
 import can
 import pytest
 
+from hil_tests.conftest import START_S
 from ucs import main
 from ucs.tests.units import unit_toml
 
@@ -74,7 +75,7 @@ def test_it_is_checked_replayed_and_explained(folder: Path, capsys: pytest.Captu
 @pytest.mark.vcan
 def test_its_fault_is_repaired_on_a_real_bus(folder: Path, process: Any) -> None:
     supervisor = process("run", "unit.toml", cwd=folder)
-    supervisor.expect("supervising", within_s=30)
+    supervisor.expect("supervising", START_S)
     with can.Bus("vcan0", interface="socketcan") as bus:
         fan = False
         end = time.monotonic() + 60

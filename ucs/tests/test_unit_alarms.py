@@ -10,13 +10,13 @@ from bridge.link import Refusal
 from level1 import health
 from level1.bus_health import WINDOW_NS, BusHealth, Report, Traffic
 from level1.catalog import Catalog
-from level1.event import Event, Output
+from level1.event import Output
 from level1.frame import EXTENDED, Frame
 from level1.io import definitions
 from level1.nmea import Navigator
 from level1.supervisor import Supervisor
 from level1.tests.plug import FIX, sentence
-from ucs.tests.proof import proves
+from ucs.tests.proof import lives, proves
 from ucs.uplink import refused
 
 MS, S = 1_000_000, 1_000_000_000
@@ -30,15 +30,6 @@ Story = Callable[[BusHealth], Iterable[Report]]
 @pytest.fixture(scope="module")
 def catalog() -> Catalog:
     return definitions.load(["ucs.dbc"])
-
-
-def lives(outputs: Iterable[Output]) -> dict[str, list[str]]:
-    """What was reported of each alarm."""
-    found: dict[str, list[str]] = {}
-    for output in outputs:
-        if isinstance(output, Event):
-            found.setdefault(output.alarm, []).append(output.event)
-    return found
 
 
 # --- buses --------------------------------------------------------------------------------------------------------------------
