@@ -153,7 +153,7 @@ class FlamingTool(Node):
         self._sensor.advance(t_ns, self.plant.flame)
         flame = self._sensor.sees
         self.safeguard.advance(t_ns, gas=gas, spark=command["Igniter"] == "On", fresh=fresh, flame=flame,
-                               closed=self._closed)
+                               opened=self._valve.position == "Open", closed=self._closed)
         if gas:
             self._gas_wanted_ns = t_ns
         self._follow(t_ns, fresh and t_ns - self._gas_wanted_ns < MODE_END_NS, flame)
@@ -325,7 +325,7 @@ class FlamingTool(Node):
 _STATES = {
     "Ready": "purged: unburnt gas has dispersed",
     "FlameLost": "safeguard closes the gas valve: flame lost",
-    "IgnitionFailed": "safeguard closes the gas valve: no flame within 3 s",
+    "IgnitionFailed": "safeguard closes the gas valve: no flame in the trial",
     "CommandsLost": "safeguard closes the gas valve: commands stopped",
 }
 

@@ -7,19 +7,22 @@ strictest figures of DESIGN §5):
         ──demand changes from Closed to Open together with Igniter On──▶ Ignition
         ──valve and burners closed, tight, no flame, for 30 s──▶ Ready    (CommandsLost: and commands are back)
     Ignition: valve open, spark as demanded
-        ──flame seen──▶ Running      ──3 s──▶ IgnitionFailed
+        ──flame seen──▶ Running      ──3 s, or 0.8 s without the valve being open──▶ IgnitionFailed
     Running: valve open, no spark
         ──no flame for 0.5 s──▶ FlameLost
     Ignition, Running:   ──demand Closed──▶ Purging      ──commands stop──▶ CommandsLost
 
 After FlameLost, IgnitionFailed and CommandsLost a demand of Open that just goes on does nothing: Closed must be commanded
 first. The simulated safeguard deliberately does *not* enforce the purge before an ignition, it only reports it (Ready): a
-supervisor or mission controller that skips the purge is thus caught by the plant's hazard record, not hidden.
+supervisor or mission controller that skips the purge is thus caught by the plant's hazard record, not hidden. A valve that falls
+closed in a trial ends it: opened again it would bring new gas to a spark that burns over what has just flowed.
 """
 from __future__ import annotations
 
 TRIAL_NS = 3_000_000_000
 """Longest ignition trial."""
+NOT_OPEN_NS = 800_000_000
+"""The valve may stand closed for so long in a trial: longer than a supervisor needs to see that it does not open."""
 FLAME_FAILURE_NS = 500_000_000
 """From the sensor's loss of the flame to closing; with sensor (0.2 s) and valve (0.04 s) the valve is closed within 1 s."""
 PURGE_NS = 30_000_000_000
@@ -34,7 +37,7 @@ class Safeguard:
     def __init__(self, now_ns: int, *, purged: bool = False):
         self.state = "Ready" if purged else "Purging"
         self._armed = False
-        self._trial_ns = 0
+        self._trial_ns = self._open_ns = 0
         self._flame_ns = now_ns
         self._quiet_ns = now_ns - PURGE_NS if purged else now_ns
 
@@ -48,13 +51,15 @@ class Safeguard:
         """Whether the igniter may spark."""
         return self.state == "Ignition"
 
-    def advance(self, now_ns: int, *, gas: bool, spark: bool, fresh: bool, flame: bool, closed: bool) -> None:
-        """One tick. gas, spark: what is commanded; fresh: commands come; flame: sensor; closed: the valve is
-        fully closed and tight, and so are the burners."""
+    def advance(self, now_ns: int, *, gas: bool, spark: bool, fresh: bool, flame: bool, opened: bool, closed: bool) -> None:
+        """One tick. gas, spark: what is commanded; fresh: commands come; flame: sensor; opened: the valve is not closed;
+        closed: it is fully closed and tight, and so are the burners."""
         if fresh and not gas:
             self._armed = True
         if flame:
             self._flame_ns = now_ns
+        if opened:
+            self._open_ns = now_ns
         if flame or not closed:
             self._quiet_ns = now_ns
         if self.state in _CLOSED_STATES:
@@ -66,7 +71,7 @@ class Safeguard:
         elif self.state == "Ignition":
             if flame:
                 self.state = "Running"
-            elif now_ns - self._trial_ns >= TRIAL_NS:
+            elif now_ns - self._trial_ns >= TRIAL_NS or now_ns - self._open_ns >= NOT_OPEN_NS:
                 self.state = "IgnitionFailed"
         elif now_ns - self._flame_ns >= FLAME_FAILURE_NS:
             self.state = "FlameLost"
@@ -74,7 +79,7 @@ class Safeguard:
     def _while_closed(self, now_ns: int, gas: bool, spark: bool, fresh: bool) -> None:
         if gas and spark and self._armed:
             self._armed = False
-            self._trial_ns = now_ns
+            self._trial_ns = self._open_ns = now_ns
             self.state = "Ignition"
         elif now_ns - self._quiet_ns < PURGE_NS:
             if self.state == "Ready":

@@ -26,9 +26,16 @@ def test_no_flame_without_a_spark() -> None:
 
 
 def test_no_flame_without_gas() -> None:
-    bench = Bench().break_("gas_valve", "stuck closed").run(0.3).order(**LIT).run(2.5)
+    bench = Bench().break_("gas_valve", "stuck closed").run(0.3).order(**LIT).run(0.7)
     assert bench.status("Igniter") == "On"
+    assert bench.run(0.5).status("GasValveDemand") == "Closed" and bench.status("Igniter") == "Off", "the trial has ended"
     assert not bench.tool.plant.flame
+
+
+def test_a_valve_that_falls_closed_in_a_trial_ends_it_and_gets_no_second_chance_over_the_gas_that_has_flowed() -> None:
+    bench = Bench().break_("igniter", "dead").run(0.3).order(**LIT).run(0.5)
+    bench.break_("gas_valve", "stuck closed", commands=2).break_("igniter", "works").run(4)
+    assert bench.status("Safeguard") == "IgnitionFailed" and bench.tool.hazards == []
 
 
 def test_the_ignition_trial_ends_after_three_seconds() -> None:
@@ -188,9 +195,10 @@ def test_a_valve_stuck_closed_falls_closed_and_opens_again_after_so_many_command
     bench = Bench().light().break_("gas_valve", "stuck closed").run(1)
     assert bench.status("GasValve") == "Closed"
     assert bench.status("PilotFlame") == "Off"
-    later = Bench().break_("gas_valve", "stuck closed", commands=2).run(0.3).order(**LIT).run(1.5)
-    assert later.status("GasValve") == "Closed"
-    assert later.run(1).status("GasValve") == "Open"
+    later = Bench().break_("gas_valve", "stuck closed", commands=2).run(0.3)
+    for outcome in ("Closed", "Closed", "Open"):
+        assert later.order(**LIT).run(0.5).status("GasValve") == outcome
+        later.order(GasValve="Closed", Igniter="Off").run(1)
 
 
 def test_a_valve_stuck_open_lets_gas_flow_and_never_reads_ready() -> None:

@@ -34,7 +34,7 @@ def _wrong_mode(w: World, n: int) -> bool:
 FLAME_OUT = symptom("PilotFlameOut", 0.9, lambda w, n: w.flamer.talks and w.flamer.works and _wanted(w)
                      and not w.flamer.sees_flame)
 UNLIT = symptom("PilotIgnitionFailure PilotFlameOut", 5.4, _unlit)
-VALVE_NOT_OPEN = symptom("GasValveNotOpened", 1.0, lambda w, n: w.flamer.talks and w.flamer.safeguard.valve == "Open"
+VALVE_NOT_OPEN = symptom("GasValveNotOpened", 0.7, lambda w, n: w.flamer.talks and w.flamer.safeguard.valve == "Open"
                           and w.flamer.valve == "Closed")
 VALVE_NOT_CLOSED = symptom("GasValveNotClosed", 1.5, lambda w, n: w.flamer.talks and w.flamer.safeguard.valve == "Closed"
                             and w.flamer.valve == "Open")
