@@ -123,6 +123,7 @@ class CanopenNode(Node):
 
     `tick` is for the device's own work, `reboot` puts it back to where it stands after switching on. device: the package's node.
     errors: those that last, by code and maker's bytes, and whether the emergency, which is sent once, has left the device.
+    ended_unheard: the end of one has not: who heard of it still believes in it, until a boot-up or the end of all errors is heard.
     """
 
     EDS: ClassVar[str] = ""
@@ -132,6 +133,7 @@ class CanopenNode(Node):
     def __init__(self, name: str, codec: Codec, *, start_ns: int = 0):
         super().__init__(name, codec, start_ns=start_ns)
         self.errors: dict[tuple[int, bytes], bool] = {}
+        self.ended_unheard = False
         self.wire = Wire(start_ns)
         self.device = _local_node(self.EDS, self.NODE_ID)
         self.device.associate_network(self.wire)
@@ -212,8 +214,13 @@ class CanopenNode(Node):
             return
         del self.errors[code, maker]
         self._set_register()
-        if self.nmt_state not in (STOPPED, INITIALISING):
+        speaks = self.nmt_state not in (STOPPED, INITIALISING)
+        if speaks:
             self.device.emcy.reset(self._register(), bytes(5))
+        if not speaks or not self.talks:
+            self.ended_unheard = True
+        elif not self.errors:
+            self.ended_unheard = False
 
     def _register(self) -> int:
         register = GENERIC if self.errors else 0
@@ -255,6 +262,7 @@ class CanopenNode(Node):
         self.wire.now_ns = t_ns
         self.wire.periodic.clear()
         self.device.nmt._send_task = None
+        self.ended_unheard = self._silent and (self.ended_unheard or bool(self.errors))
         self.errors.clear()
         self._set_register()
         self._sent_ns.clear()

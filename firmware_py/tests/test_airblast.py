@@ -196,6 +196,16 @@ def test_an_error_stands_in_the_register_and_in_the_history_until_it_is_cleared(
     assert device.device.sdo[0x1003][0].raw == 0
 
 
+def test_an_end_of_an_error_that_nobody_hears_is_told_apart() -> None:
+    bench = Bench().run(2)
+    device = bench.sprayer
+    bench.break_(device, "tank", "empty").run(0.1)
+    bench.break_(device, "", "silent").break_(device, "tank", "filled").run(0.1)
+    assert device.ended_unheard and not device.errors
+    bench.break_(device, "", "works").break_(device, "", "emergency").run(0.1).break_(device, "", "works").run(0.1)
+    assert not device.ended_unheard
+
+
 @pytest.mark.parametrize(("can_id", "data"), [(0, b"\x81"), (0, b""), (0x62A, b""), (0x62A, b"\xff"), (0x62A, bytes(8)),
                                               (0x62A, b"\x70" + bytes(7)), (0x62A, b"\x60" + bytes(7)),
                                               (0x22A, b"\1"), (0x22A, b"")])

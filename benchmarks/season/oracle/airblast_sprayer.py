@@ -119,4 +119,6 @@ NATURAL: Mapping[str, State] = {
 LINGERS: Mapping[str, State] = {
     "AirblastTankLow": lambda w: w.airblast.plant.level_percent < 20.8,
     "AirblastTankCritical": lambda w: w.airblast.plant.level_percent < 10.8,
+    "DeviceEmergency": lambda w: w.airblast.ended_unheard or w.ultrasonic.ended_unheard,
 }
+"""An emergency's end is sent once (CiA 301): after one that nobody heard, the error stands until the device boots or has another."""
