@@ -121,4 +121,4 @@ LINGERS: Mapping[str, State] = {
     "AirblastTankCritical": lambda w: w.airblast.plant.level_percent < 10.8,
     "DeviceEmergency": lambda w: w.airblast.ended_unheard or w.ultrasonic.ended_unheard,
 }
-"""An emergency's end is sent once (CiA 301): after one that nobody heard, the error stands until the device boots or has another."""
+"""An emergency's end is sent once (CiA 301): after one that nobody heard, the error stands until a boot or another end."""
