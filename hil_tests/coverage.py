@@ -178,7 +178,9 @@ def problems(specification: str, known: Catalog, found: Sequence[Proof]) -> list
     result += [f"{producer}, {what}: the specification has no such message" for producer, what in MESSAGES
                if Line(producer, what) not in monitoring]
     for name in dict.fromkeys(name for names in ALARMS.values() for name in names):
-        result += _missing(name, known.alarms.get(name), [proof for proof in found if proof.what == name and not proof.vcan])
+        result += _missing(name, known.alarms.get(name))
+    for alarm in known.alarms.values():
+        result += _unseen(alarm, found)
     for (producer, name), file in MESSAGES.items():
         if not _parts(name, file):
             result.append(f"{file}: no message with MonitorAs {name}")
@@ -192,7 +194,7 @@ def problems(specification: str, known: Catalog, found: Sequence[Proof]) -> list
     return result
 
 
-def _missing(name: str, alarm: Alarm | None, found: Sequence[Proof]) -> Iterator[str]:
+def _missing(name: str, alarm: Alarm | None) -> Iterator[str]:
     if alarm is None:
         yield f"{name}: no such alarm is defined"
         return
@@ -200,10 +202,13 @@ def _missing(name: str, alarm: Alarm | None, found: Sequence[Proof]) -> Iterator
         yield f"{name}: no repair; give one, or say why there is none in hil_tests/coverage.py"
     if alarm.repair and name in NOT_REPAIRED:
         yield f"{name}: has a repair now; take it out of NOT_REPAIRED in hil_tests/coverage.py"
-    seen = {word for proof in found for word in proof.words}
+
+
+def _unseen(alarm: Alarm, found: Iterable[Proof]) -> Iterator[str]:
+    seen = {word for proof in found if proof.what == alarm.name and not proof.vcan for word in proof.words}
     for word in (*LIFE, *(REPAIRED if alarm.repair else ())):
         if word not in seen:
-            yield f'{name}: no test in virtual time says covers("{name}", …, "{word}")'
+            yield f'{alarm.name}: no test in virtual time says covers("{alarm.name}", …, "{word}")'
 
 
 def _on_the_wire(found: Iterable[Proof]) -> set[str]:
@@ -215,9 +220,9 @@ def _on_the_wire(found: Iterable[Proof]) -> set[str]:
 HEAD = """# What proves each line of the specification
 
 Made by `make coverage` from [the specification](SPEC.md), the definitions in [dbc/](../dbc) and the marks of the tests; do not edit
-it. `hil_tests/test_coverage.py` fails when it is not as it would be made now, when a line has no alarm or message, an alarm
-neither a repair nor a reason for none, or when no test in virtual time has seen it raised and cleared, and a repair succeed, be
-verified, and give up.
+it. `hil_tests/test_coverage.py` fails when it is not as it would be made now, when a line has no alarm or message, or its alarm
+neither a repair nor a reason for none, or when no test in virtual time has seen an alarm raised and cleared, and a repair succeed,
+be verified, and give up.
 
 Each test injects the fault into the simulated device. *Virtual time*: level 1 and the devices on a simulated bus, in one
 process. *vcan*: device, `ucs run` and where needed level 2 as processes of their own on real SocketCAN. The numbers are
@@ -228,7 +233,7 @@ OTHERS = """
 ## Alarms beyond the specification
 
 What every alarm must do whatever its condition is (delays, lost data, flapping) is tested for each of them, these and those
-above, by `level1/tests/test_every_alarm.py`.
+above, by `level1/tests/test_every_alarm.py`. Tests in virtual time have seen as much of each of these as of those above.
 """
 
 

@@ -60,9 +60,9 @@ def test_what_no_test_has_seen_is_told(specification: str, known: Catalog, found
             and not proof.what.startswith(f"{MONITORING}flaming tool")]
     told = problems(specification, known, [*less, Proof("Nonsense", ("raised",), "test_x", False)])
     assert told == [
+        'NoMainFlow: no test in virtual time says covers("NoMainFlow", …, "repaired")',
         'UnitStopped: no test in virtual time says covers("UnitStopped", …, "raised")',
         'UnitStopped: no test in virtual time says covers("UnitStopped", …, "cleared")',
-        'NoMainFlow: no test in virtual time says covers("NoMainFlow", …, "repaired")',
         'flaming tool, implement: no test says covers("monitoring: flaming tool implement")',
         'flaming tool, burners: no test says covers("monitoring: flaming tool burners")',
         "test_x: covers Nonsense, which is neither an alarm nor a monitoring message"]

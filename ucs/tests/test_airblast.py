@@ -169,9 +169,18 @@ def test_each_sensor_that_no_reset_helps_is_locked_out(catalog: Catalog, lives: 
 
 
 @pytest.mark.covers("AirblastTankCritical", "raised", "cleared")
+@pytest.mark.covers("AirblastTankLow", "raised", "cleared")
 def test_a_tank_that_is_filled_again_is_no_alarm_any_more(catalog: Catalog) -> None:
     field = orchard(catalog, "at 12 s: sprayer.tank empty", "at 25 s: sprayer.tank filled").run()
     assert (field.life("AirblastTankCritical"), field.life("AirblastTankLow")) == (PASSED, PASSED)
+
+
+@pytest.mark.parametrize(("alarm", "device"), [
+    proves({alarm: [*REPAIRED, "locked_out"]}, alarm, device)
+    for alarm, device in (("AirblastNotOperational", "sprayer"), ("UltrasonicNotOperational", "sensors"))])
+def test_a_device_that_is_stopped_again_and_again_is_locked_out(catalog: Catalog, alarm: str, device: str) -> None:
+    field = orchard(catalog, *(f"at {t_s} s: {device} stopped" for t_s in (15, 25, 35))).run()
+    assert field.life(alarm)[:2 * len(REPAIRED) + 2] == [*REPAIRED * 2, "raised", "locked_out"]
 
 
 def test_every_alarm_of_the_definition_is_raised_by_some_fault(catalog: Catalog) -> None:

@@ -276,6 +276,15 @@ def test_a_receiver_that_comes_back_last_is_not_silent(catalog: Catalog) -> None
     assert "PositionSilent" not in farm(catalog, "at 20 s: tractor silent for 20 s", duration="1 min").run().raised
 
 
+@pytest.mark.covers("VehicleCommandsLost", "raised", "cleared")
+def test_a_mission_controller_that_is_back_resumes_and_nothing_is_lost_any_more(catalog: Catalog) -> None:
+    unit = farm(catalog, "at 20 s: mission silent for 3 s", orders=(*WORK, "at 30 s: mission resume"), duration="40 s").run(28)
+    assert unit.life("VehicleCommandsLost") == ["raised"]
+    assert unit.tractor.controller == "Paused"
+    assert unit.run().life("VehicleCommandsLost") == ["raised", "cleared"]
+    assert unit.kmh == pytest.approx(3)
+
+
 def test_a_reset_of_the_vehicles_computer_brakes_and_switches_off(catalog: Catalog) -> None:
     reset = farm(catalog, "at 20 s: tractor reset").run(26)
     assert reset.kmh == 0
