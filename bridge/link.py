@@ -20,6 +20,7 @@ from typing import Generic, TypeVar
 
 import msgspec
 
+from bridge.wire import is_plain
 from level1.command import Order
 from level1.event import Event, Monitor, Result
 
@@ -105,9 +106,14 @@ class _End(Generic[T]):
             except OSError:
                 break
             try:
-                found.append(self._decoder.decode(datagram))
-            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+                message = self._decoder.decode(datagram)
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, ArithmeticError):
                 self.malformed += 1
+                continue
+            if isinstance(message, Instruct) and message.order.value is not None and not is_plain(message.order.value):
+                self.malformed += 1  # supervision would reckon with it
+            else:
+                found.append(message)
         return found
 
     def close(self) -> None:

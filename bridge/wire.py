@@ -206,7 +206,7 @@ def decode(payload: bytes, kind: type[M]) -> M:
     assert isinstance(message, kind)
     for name in ("t", "value", "expires_t"):
         number = getattr(message, name, None)
-        if isinstance(number, Decimal) and not _is_plain(number):
+        if isinstance(number, Decimal) and not is_plain(number):
             raise WireError(f"{name} is no plain number")
     return message
 
@@ -275,7 +275,7 @@ def digest(payload: bytes) -> str:
     return hashlib.sha256(payload).hexdigest()
 
 
-def _is_plain(number: Decimal) -> bool:
+def is_plain(number: Decimal) -> bool:
     """Whether a number can be printed and reckoned with: `1E999999999` would fill the memory with its digits."""
     digits, exponent = number.as_tuple()[1:]
     return isinstance(exponent, int) and -EXPONENT <= exponent <= EXPONENT and len(digits) <= 2 * EXPONENT

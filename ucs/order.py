@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.link import OrderEnd
+from bridge.wire import is_plain
 from level1.command import Order
 from level1.event import Result
 from level1.io import config
@@ -86,6 +87,9 @@ def _who() -> str:
 
 def _value(text: str | None) -> Decimal | None:
     try:
-        return None if text is None else Decimal(text)
+        value = None if text is None else Decimal(text)
     except InvalidOperation:
         raise OutsideError(f'--value "{text}" is no number') from None
+    if value is not None and not is_plain(value):
+        raise OutsideError(f'--value "{text}" is no number that a signal can say')
+    return value

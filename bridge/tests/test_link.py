@@ -7,9 +7,10 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from bridge.link import Answer, Beside, BridgeLink, Instruct, Poke, RunLink, Samples
+from bridge.link import Answer, Beside, BridgeLink, Instruct, LocalEnd, Poke, RunLink, Samples
 from level1.command import Order
 from level1.event import Event, Monitor, Result, seconds
 
@@ -45,6 +46,17 @@ def test_nobody_at_the_other_end_is_told_and_no_error(journal: Path) -> None:
     assert not run.poke()
     run.close()
     assert not journal.with_name("journal.db.run.sock").exists()
+
+
+@pytest.mark.parametrize("value", ['"Infinity"', '"NaN"', "1E+999999999", '"1E+99999999999999999999"'])
+def test_an_order_with_a_value_that_nobody_can_reckon_with_does_not_reach_supervision(journal: Path, value: str) -> None:
+    run, stranger = LocalEnd(journal), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    good = msgspec.json.encode(Instruct(ORDER))
+    for datagram in (good.replace(b'"value":null', f'"value":{value}'.encode()), good):
+        stranger.sendto(datagram, str(journal.with_name("journal.db.local.sock")))
+    assert run.receive() == [Instruct(ORDER)] and run.malformed == 1
+    run.close()
+    stranger.close()
 
 
 def test_an_end_that_was_killed_is_replaced(journal: Path, ends: tuple[RunLink, BridgeLink]) -> None:

@@ -79,6 +79,7 @@ def test_without_a_run_it_says_so(unit: Path, capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.parametrize(("arguments", "told"), [
     (["reset"], "reset: which alarm?"), (["reduce_speed", "--value", "slow"], '"slow" is no number'),
+    (["reduce_speed", "--value", "Infinity"], "no number that a signal can say"),
 ])
 def test_a_wrong_order_is_one_line(unit: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], told: str) -> None:
     assert main(["order", str(unit), *arguments]) == 2
