@@ -182,6 +182,7 @@ def make_site(folder: Path, fleet: str, units: Sequence[str], hosts: Sequence[st
     except FileExistsError:
         raise SiteError(f"site {folder}: exists already; name a new folder") from None
     except OSError as error:
+        shutil.rmtree(folder, ignore_errors=True)  # a part of it would stand in the way of another try
         raise SiteError(f"site {folder}: can't be made ({error.strerror}); name a folder that this user may make") from None
     return authority
 

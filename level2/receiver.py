@@ -307,7 +307,8 @@ def event_line(arrival: Arrival) -> str:
     notes = [note for note, true in (("passive", alarm.passive), ("late", alarm.historical),
                                      ("conflict", arrival.outcome is Outcome.CONFLICT)) if true]
     note_text = ", ".join(notes)
-    return wire.shown(f"{time} {alarm.unit} {alarm.alarm} {alarm.event}{attempt}  {alarm.text}{f' ({note_text})' if notes else ''}")
+    text = f"  {alarm.text}" if alarm.text else ""
+    return wire.shown(f"{time} {alarm.unit} {alarm.alarm} {alarm.event}{attempt}{text}{f' ({note_text})' if notes else ''}")
 
 
 def _filter(fleet: str, kind: str) -> str:

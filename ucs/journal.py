@@ -16,7 +16,7 @@ import msgspec
 
 from level1.event import EVENTS, Commanded, Event, Monitor, encode
 from level1.io.config import ConfigError, duration_ns, load
-from level1.io.error import OutsideError
+from level1.io.error import OutsideError, did_you_mean
 from level1.io.journal import FIRST, JournalError, Position, Reader
 from ucs import history
 
@@ -82,10 +82,20 @@ def run(args: argparse.Namespace) -> int:
             write(entry)
             count += 1
         if not count and not args.follow:
-            print("ucs journal: nothing yet" if reader.last() == FIRST else "ucs journal: nothing of the kind", file=sys.stderr)
+            print(f"ucs journal: {_nothing(reader, query)}", file=sys.stderr)
         if args.follow:
             _follow(reader, listing, write)
     return 0
+
+
+def _nothing(reader: Reader, query: Query) -> str:
+    """Why nothing was found."""
+    if reader.last() == FIRST:
+        return "nothing yet"
+    names = {event.alarm for event in Listing(reader, Query()).new() if isinstance(event, Event)} if query.alarm else set()
+    if query.alarm and query.alarm not in names:
+        return f'no event of an alarm called "{query.alarm}"{did_you_mean(query.alarm, names)}'
+    return "nothing of the kind"
 
 
 class Query(NamedTuple):

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import signal
+import sys
 from contextlib import ExitStack
 from decimal import Decimal
 from pathlib import Path
@@ -84,6 +85,9 @@ def _command(args: argparse.Namespace) -> int:
     finally:
         commander.close()
     print(shown(f"{args.unit}: {args.name} {result.outcome}" + (f": {result.reason}" if result.reason else "")))
+    if result.reason == "unknown key":
+        print(f'ucs: the unit has no key called "{signer.key}" in the file that its [bridge] keys names (see ucs keys --help)',
+              file=sys.stderr)
     return 0 if result.outcome == "done" else 1
 
 

@@ -7,10 +7,12 @@ definitions have errors (all are printed), 2 where something outside prevents th
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 INTERRUPTED, BROKEN_PIPE = 130, 141
@@ -50,6 +52,9 @@ GROUPS = {
         "keys": Command("ucs.keys", "make and list the keys of those who may command"),
     },
 }
+OTHER_NAMES = {"handbook": "alarms FILE.dbc --handbook handbook.html", "level1": "run unit.toml", "supervise": "run unit.toml",
+               "log": "journal unit.toml", "ack": "order unit.toml acknowledge", "reset": "order unit.toml reset ALARM"}
+"""What people may call something that has another name here."""
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
@@ -121,7 +126,8 @@ def _run(words: list[str]) -> int:
     from level1.io.error import OutsideError, did_you_mean
     chosen = words[0] if words else "--help"
     if chosen not in COMMANDS and not chosen.startswith("-"):
-        return _refuse(f'no command is called "{chosen}"{did_you_mean(chosen, COMMANDS)}')
+        meant = OTHER_NAMES.get(chosen)
+        return _refuse(f'no command is called "{chosen}"' + (f"; it is `ucs {meant}`" if meant else did_you_mean(chosen, COMMANDS)))
     parser = build_parser(chosen if chosen in COMMANDS else None)
     if not words:
         parser.print_help(sys.stderr)
@@ -142,7 +148,17 @@ def _run(words: list[str]) -> int:
         raise
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        return _refuse(f"{where}{error.strerror or error}")
+        return _refuse(f"{where}{_reason(error)}")
+
+
+def _reason(error: OSError) -> str:
+    """What the system said, and what to do where that is plain."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "the disk is full, and what was being written is not whole; make room, then run it again"
+    folder = Path(error.filename).parent if isinstance(error.filename, str | Path) else Path()
+    if error.errno == errno.ENOENT and not folder.is_dir():
+        return f"there is no folder {folder}"
+    return error.strerror or str(error)
 
 
 def _refuse(*problems: str) -> int:

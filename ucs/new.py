@@ -30,5 +30,9 @@ def run(args: Namespace) -> int:
             file.write(text)
     except FileExistsError as error:
         raise OutsideError(f"{path}: is there already; choose another name") from error
+    except OSError:
+        if path.is_file():
+            path.unlink()  # a part of it would stand in the way of another try
+        raise
     print(f"{path}: three alarms to start from; next: ucs check {path}")
     return 0

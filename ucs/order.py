@@ -14,8 +14,8 @@ from bridge.link import OrderEnd
 from bridge.wire import is_plain
 from level1.command import Order
 from level1.event import Result
-from level1.io import config
-from level1.io.error import OutsideError
+from level1.io import config, definitions
+from level1.io.error import OutsideError, did_you_mean
 
 PATIENCE_S = 5.0
 REFUSED = 1
@@ -55,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
         origin="local", by=_who()))
     if result is None:
         raise OutsideError(f"`ucs run` of {settings.unit.name} does not answer: is it running, as this user? (see ucs status)")
-    print(f"{args.name} {args.target}".strip() + f": {result.outcome}" + (f", {result.reason}" if result.reason else ""))
+    print(f"{args.name} {args.target}".strip() + f": {result.outcome}" + (f", {result.reason}" if result.reason else "")
+          + (_known(settings, args.name, args.target, result.reason) if result.reason else ""))
     return 0 if result.outcome == "done" else REFUSED
 
 
@@ -76,6 +77,18 @@ def give(journal: Path, order: Order, patience_s: float = PATIENCE_S) -> Result 
         return None
     finally:
         end.close()
+
+
+def _known(settings: config.Config, name: str, target: str, reason: str) -> str:
+    """What may have been meant, where the unit knows no such alarm or order."""
+    unknown_alarm, unknown_order = reason.startswith("unknown alarm"), reason.startswith("unknown command")
+    if not unknown_alarm and not unknown_order:
+        return ""
+    catalog = definitions.load((), settings.bus_files, settings.bus_names)
+    if unknown_alarm:
+        close = did_you_mean(target, catalog.alarms)
+        return close if "?" in close else "; `ucs alarms` lists those of a DBC file"
+    return did_you_mean(name, {"acknowledge", "reset", "pause", "resume", "stop", *catalog.commands})
 
 
 def _who() -> str:

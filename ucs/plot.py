@@ -117,6 +117,9 @@ def draw(trace: Trace, events: Sequence[Event], out: str | Path, title: str) -> 
 def check(out: str | Path) -> None:
     """Whether a picture can be written there, before work is done for it. Raises OutsideError."""
     _matplotlib()
+    formats = importlib.import_module("matplotlib.backend_bases").FigureCanvasBase.get_supported_filetypes()
+    if Path(out).suffix.lower().removeprefix(".") not in formats:
+        raise OutsideError(f"{out}: the picture can't be written: its name says no known format; end it in .png, .svg or .pdf")
     if not Path(out).absolute().parent.is_dir():
         raise OutsideError(f"{out}: the picture can't be written: there is no folder {Path(out).parent}")
 

@@ -116,6 +116,9 @@ class _Out:
         self.text = sys.stderr if args.events == "-" else sys.stdout
         self.colour = wants_colour(self.text)
         self.failed = 0
+        self._totals: Counter[tuple[str, str]] = Counter()
+        self._with: Counter[str] = Counter()
+        self._standing: Counter[str] = Counter()
 
     def begin(self, path: str) -> None:
         """A recording begins."""
@@ -151,6 +154,15 @@ class _Out:
             counts[event.alarm, event.event] += 1
             self.event(outcome.path, outcome.first_ns, event, line)
         self.end(outcome, counts)
+        self._totals += counts
+        self._with.update({alarm for alarm, _ in counts})
+        self._standing.update(outcome.standing.keys())
+
+    def totals(self) -> Iterator[str]:
+        """Each alarm's count over all recordings that other processes have done."""
+        for alarm in sorted(self._with):
+            stood = f"; still there at the end of {self._standing[alarm]}" if self._standing[alarm] else ""
+            yield f"  {alarm:<28} {_counted(self._totals, alarm)} in {self._with[alarm]} of them{stood}"
 
 
 def _check_onto(args: Namespace, paths: Sequence[str]) -> None:
@@ -245,7 +257,8 @@ def _run_season(paths: Sequence[str], task: _Task, args: Namespace, out: _Out) -
         print(f"ucs: {told} of {len(jobs)} recordings are done and kept; the same command goes on from there", file=sys.stderr)
         raise
     took_s = time.perf_counter() - started
-    print(f"{len(jobs)} recordings, {frames:,} frames in {took_s:.3f} s ({frames / took_s:,.0f} frames/s)", file=out.text)
+    print(f"{len(jobs)} recordings, {frames:,} frames in {took_s:.3f} s ({frames / took_s:,.0f} frames/s)", *out.totals(),
+          sep="\n", file=out.text)
     return 2 if out.failed else 0
 
 
@@ -286,14 +299,17 @@ def _summary(outcome: Outcome, counts: Counter[tuple[str, str]], took_s: float |
     yield f"  {outcome.frames:,} frames, {duration_s:,.3f} s of recording{speed}"
     alarms = sorted({alarm for alarm, _ in counts})
     for alarm in alarms:
-        words = ", ".join(f"{counts[alarm, word]} × {WORDS[word]}" for word in WORDS if counts[alarm, word])
         end = f"; at the end {outcome.standing[alarm]}" if alarm in outcome.standing else ""
-        yield f"  {alarm:<28} {words}{end}"
+        yield f"  {alarm:<28} {_counted(counts, alarm)}{end}"
     if not alarms:
         yield "  no alarm"
     if outcome.sends:
         yield f"  repairs would have sent {outcome.sends:,} frames"
     yield ""
+
+
+def _counted(counts: Counter[tuple[str, str]], alarm: str) -> str:
+    return ", ".join(f"{counts[alarm, word]} × {WORDS[word]}" for word in WORDS if counts[alarm, word])
 
 
 def _events_file(path: str | None, stack: ExitStack) -> BinaryIO | None:

@@ -20,7 +20,7 @@ def comparison_html(compared: Comparison) -> str:
     """The report of a comparison."""
     total = sum(map(len, compared.changes.values()))
     body = [f"<h1>Alarms: {escape(compared.old.name)} against {escape(compared.new.name)}</h1>",
-            f"<p>{len(compared.recorded)} recordings, {compared.hours:.2f} h. "
+            f"<p>{_recordings(len(compared.recorded))}, {compared.hours:.2f} h. "
             f"<b>{total or 'No'} difference{'' if total == 1 else 's'}{_kinds(compared)}.</b></p>",
             *(f"<p class=small>{side.name}: {escape(', '.join(side.files))}</p>" for side in (compared.old, compared.new)),
             _alarm_table(compared), _rate_table(compared)]
@@ -37,6 +37,10 @@ def comparison_html(compared: Comparison) -> str:
     return _page("ucs diff", body)
 
 
+def _recordings(count: int) -> str:
+    return f"{count} recording{'s' * (count != 1)}"
+
+
 def sweep_html(alarm: str, attribute: str, rows: Sequence[tuple[str, Behaviour]], hours: float, recordings: int) -> str:
     """The report of a sweep: activations over the values tried."""
     most = max((found.raised for _, found in rows), default=0) or 1
@@ -50,7 +54,7 @@ def sweep_html(alarm: str, attribute: str, rows: Sequence[tuple[str, Behaviour]]
     cells = "".join(f"<tr><td>{escape(value)}</td><td>{found.raised}</td><td>{found.per_hour:.2f}</td>"
                     f"<td>{found.standing_s:.1f} s</td><td>{found.chatter}</td></tr>" for value, found in rows)
     return _page("ucs diff --sweep", [
-        f"<h1>{escape(alarm)}: {escape(attribute)}</h1><p>{recordings} recordings, {hours:.2f} h</p>",
+        f"<h1>{escape(alarm)}: {escape(attribute)}</h1><p>{_recordings(recordings)}, {hours:.2f} h</p>",
         f'<figure><svg viewBox="0 0 {WIDTH} {30 + ROW * len(rows)}" font-family="sans-serif">{"".join(bars)}</svg></figure>',
         f"<table><tr><th>{escape(attribute)}</th><th>raised</th><th>per hour</th><th>standing</th><th>chattered</th></tr>{cells}"
         "</table>"])

@@ -35,8 +35,24 @@ DESCRIPTION = """\
 Runs the nodes of a scenario and tells what happens. Without a bus in virtual time, faster than real; with --bus, or --interface
 and --channel, in real time on that bus.
 """
-EPILOG = """\
-A name that is no file is looked up among the shipped scenarios; --list shows them, and what scenarios can say.
+EXAMPLE = """\
+  title = "Wind, and an igniter that fails for a while"
+  seed = 7                                     # the same seed gives the same run
+  duration = "3 min"
+  orders = ["at 1 s: flaming on", "at 5 s: burner[2] high"]
+  faults = ["at 20 s: flamer.pilot blown out", "at 90 s: flamer.igniter dead for 30 s"]
+  [nodes.flamer]
+  program = "flaming_tool"
+  wind = "5 m/s"
+  [nodes.mission]
+  program = "mission_controller"
+"""
+EPILOG = f"""\
+A name that is no file is looked up among the shipped scenarios; --list shows them, and every program, setting, order and fault
+that one of your own can have:
+
+{EXAMPLE}
+Examples:
 
   ucs simulate healthy.toml                            ten minutes of work in a moment
   ucs simulate windy.toml --supervise --plot windy.png level 1 beside the nodes, and a picture of it

@@ -160,6 +160,8 @@ def look(settings: Config) -> Picture:
 
 def _journal(path: Path, has_bridge: bool, running: bool) -> JournalStanding:
     from level1.io.journal import FIRST, JournalError, Reader
+    if not path.exists():
+        return JournalStanding(str(path), fault=f"journal {path}: is not there yet; `ucs run` begins it")
     try:
         with Reader(path) as reader:
             last = reader.last()
@@ -373,9 +375,10 @@ def _bus_word(bus: BusStanding) -> str:
 def _journal_line(picture: Picture) -> str:
     run, journal = picture.run, picture.journal
     if run and run.journal_fault:
-        waiting = f"; {run.journal_waiting} events wait in memory" if run.journal_waiting else ""
-        return f"{run.journal_fault}{waiting}" + f", {run.journal_lost} are lost" * bool(run.journal_lost)
-    return journal.fault or f"{journal.path}: {'good' if run else 'readable'}; last event {journal.newest_utc or 'never'}"
+        return run.journal_fault.removeprefix("journal ")
+    if journal.fault:
+        return journal.fault.removeprefix("journal ")
+    return f"{journal.path}: {'good' if run else 'readable'}; last event {journal.newest_utc or 'never'}"
 
 
 def _level2_line(picture: Picture) -> str:

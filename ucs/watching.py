@@ -14,7 +14,7 @@ from level1.catalog import Catalog, Message
 from level1.decode import GOOD, NEVER, OLD, QUALITY_WORDS
 from level1.event import Event
 from level1.frame import BUS_SHIFT, ERROR, EXTENDED, Frame, frame_key
-from level1.freeze_frame import physical
+from level1.freeze_frame import STATE_WORDS, physical
 from level1.health import GNSS_MESSAGES, HOST_MESSAGES
 from level1.supervisor import Supervisor
 from ucs.attendant import alarm_standing, gravest
@@ -107,6 +107,7 @@ class Watching:
         self.events: deque[Event] = deque(maxlen=EVENTS)
         self.frames = 0
         self._own = {*HOST_MESSAGES, *GNSS_MESSAGES.values(), *(alarm.message for alarm in catalog.alarms.values())}
+        self._alarms = {(alarm.message, alarm.signal) for alarm in catalog.alarms.values()}
         self._cells: dict[str, list[Cell]] = {}
         for cell in self._supervisor.board.cells.values():
             self._cells.setdefault(cell.message.name, []).append(cell)
@@ -179,7 +180,7 @@ class Watching:
         values = []
         for cell in cells:
             raw, quality = self._supervisor.board.sample(cell)
-            values.append(Value(cell.signal.name, "" if raw is None else _text(physical(cell, raw)), cell.signal.unit,
+            values.append(Value(cell.signal.name, "" if raw is None else self._value(cell, raw), cell.signal.unit,
                                 QUALITY_WORDS[quality]))
             qualities.add(quality)
         never, own = page.level < 0, message.name in self._own
@@ -187,6 +188,13 @@ class Watching:
         return Heard(message.name, bus, _ident(key), None if never else hz, message.cycle_ns / 1e9 if message.cycle_ns else None,
                      None if never else max(0, now_ns - page.t_ns) / 1e9, _state(page, qualities, hz, message, own), own,
                      tuple(values))
+
+
+    def _value(self, cell: Cell, raw: int | float) -> str:
+        """The value as people read it; states of alarms by name, whether their file has a value table for them or not."""
+        if isinstance(raw, int) and raw < len(STATE_WORDS) and (cell.message.name, cell.signal.name) in self._alarms:
+            return STATE_WORDS[raw]
+        return _text(physical(cell, raw))
 
 
 def _state(page: Page, qualities: set[int], hz: float | None, message: Message, own: bool) -> str:

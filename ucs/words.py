@@ -137,7 +137,8 @@ class Words:
 
     def _count(self, node: Count, op: Operator, value: Decimal) -> str:
         how = {">=": "at least ", ">": "more than ", "<": "fewer than ", "<=": "at most ", "==": "", "!=": "not just "}[op]
-        return f"the alarm {node.alarm} was raised {how}{value:f} times within {duration(node.window_ns)}"
+        times = "once" if value == 1 else f"{value:f} times"
+        return f"the alarm {node.alarm} was raised {how}{times} within {duration(node.window_ns)}"
 
     def _quality(self, node: Quality, negated: bool) -> str:
         subject = self.signal(node.message, node.signal) if node.signal else node.message

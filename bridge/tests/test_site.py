@@ -2,6 +2,8 @@
 level 2 over mutual TLS."""
 from __future__ import annotations
 
+import errno
+import os
 import socket
 import stat
 import subprocess
@@ -184,3 +186,14 @@ def test_names_that_do_not_do_are_told(tmp_path: Path, fleet: str, units: list[s
 def test_a_folder_that_exists_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(SiteError, match="exists already; name a new folder"):
         make_site(tmp_path, "farm", ["t"], ["localhost"])
+    assert tmp_path.is_dir()
+
+
+def test_a_site_that_can_not_be_finished_stands_in_nobodys_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with monkeypatch.context() as patch:
+        patch.setattr("bridge.site._let_mosquitto_read", full)
+        with pytest.raises(SiteError, match="can't be made"):
+            make_site(tmp_path / "site", "farm", ["t"], ["localhost"])
+    make_site(tmp_path / "site", "farm", ["t"], ["localhost"])

@@ -100,8 +100,10 @@ def test_csv_has_a_row_for_each_event(unit: Path, capsys: pytest.CaptureFixture[
 
 
 def test_nothing_to_show_is_told_apart_from_nothing_yet(unit: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["journal", str(unit), "--alarm", "Other"]) == 0
+    assert main(["journal", str(unit), "--alarm", "PilotFlameOut", "--event", "locked_out"]) == 0
     assert "nothing of the kind" in capsys.readouterr().err
+    assert main(["journal", str(unit), "--alarm", "PilotFlameOot"]) == 0
+    assert 'no event of an alarm called "PilotFlameOot"; did you mean "PilotFlameOut"?' in capsys.readouterr().err
     Journal(tmp_path / "empty.db", "tractor-8").close()
     assert main(["journal", str(tmp_path / "empty.db")]) == 0
     assert "nothing yet" in capsys.readouterr().err

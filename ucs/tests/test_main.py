@@ -104,7 +104,24 @@ def test_a_file_that_cannot_be_opened_is_one_line_and_2(given: Any, capsys: pyte
 
     given(fail)
     assert command.main(["given"]) == 2
-    assert capsys.readouterr().err == "ucs: /nowhere/at/all: No such file or directory\n"
+    assert capsys.readouterr().err == "ucs: /nowhere/at/all: there is no folder /nowhere/at\n"
+
+
+def test_a_full_disk_is_one_line_and_2(given: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail(args: Namespace) -> int:
+        with open("/dev/full", "w") as file:
+            file.write("x")
+        return 0
+
+    given(fail)
+    assert command.main(["given"]) == 2
+    assert capsys.readouterr().err == ("ucs: the disk is full, and what was being written is not whole; make room, then run it "
+                                       "again\n")
+
+
+def test_a_command_by_another_name_is_answered_with_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.main(["handbook"]) == 2
+    assert "it is `ucs alarms FILE.dbc --handbook handbook.html`" in capsys.readouterr().err
 
 
 def test_wrong_definitions_print_all_problems_and_1(given: Any, capsys: pytest.CaptureFixture[str]) -> None:

@@ -120,6 +120,15 @@ def test_alarms_as_they_look_from_here(catalog: Catalog) -> None:
     assert (alarm.name, alarm.state, alarm.age_s) == ("HopperEmpty", "Active", 2.5)
 
 
+def test_the_state_of_an_alarm_is_a_word_though_its_file_has_no_value_table_for_it(tmp_path: Path) -> None:
+    file = tmp_path / "seeder.dbc"
+    file.write_text("\n".join(line for line in SEEDER.splitlines() if not line.startswith("VAL_ 1680")))
+    found = Watching(load([file]), "field", 0)
+    found.take([Frame(0, 0x690, b"\x03")], 0)
+    message = next(message for message in found.messages(0) if message.name == "SEEDER_ALARMS")
+    assert [(value.name, value.text) for value in message.values] == [("HopperEmpty", "LockedOut")]
+
+
 # --- attached to a run ------------------------------------------------------------------------------------------------------
 
 

@@ -67,7 +67,7 @@ def test_only_someone_at_the_machine_lets_a_stopped_unit_work_again(unit: Path, 
     out = capsys.readouterr().out
     assert codes == [0, 0, 1]
     assert "resume: done\n" in out and "reset PilotFlameOut: done\n" in out
-    assert "reset PilotFlameOot: refused, unknown alarm PilotFlameOot" in out
+    assert 'reset PilotFlameOot: refused, unknown alarm PilotFlameOot; did you mean "PilotFlameOut"?' in out
 
 
 def test_without_a_run_it_says_so(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:

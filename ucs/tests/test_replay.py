@@ -151,7 +151,7 @@ def test_one_recording_that_fails_does_not_stop_the_others(replay: Run, flame_lo
 
 @pytest.mark.parametrize(("words", "code", "error"), [
     (("a.log",), 2, "ucs: no definitions: give --dbc FILE …, or --unit-toml FILE\n"),
-    (("a.log", "--dbc", "flaming_tool.dbc", "--events", "/nowhere/x"), 2, "ucs: /nowhere/x: No such file or directory\n"),
+    (("a.log", "--dbc", "flaming_tool.dbc", "--events", "/nowhere/x"), 2, "ucs: /nowhere/x: there is no folder /nowhere\n"),
     (("a.log", "--unit-toml", "/nowhere.toml"), 2, "ucs: /nowhere.toml: no such file; give the path of a unit.toml\n"),
 ])
 def test_what_is_missing_is_one_line(replay: Run, words: tuple[str, ...], code: int, error: str) -> None:

@@ -96,7 +96,8 @@ def test_several_processes_print_and_write_what_one_does(replay: Run, folder: Pa
     two = replay(*words, folder / "two.jsonl", "--jobs", 2)
     assert one[0] == two[0] == 0
     lines, others = one[1].splitlines(), two[1].splitlines()
-    assert lines[:-1] == others[:-1] and lines[-1].startswith("3 recordings, 240 frames in ")
+    assert lines[:-2] == others[:-2] and lines[-2].startswith("3 recordings, 240 frames in ")
+    assert lines[-1] == others[-1] == f"  {'TankLow':<28} 3 × raised, 3 × cleared in 3 of them"
     assert (folder / "one.jsonl").read_bytes() == (folder / "two.jsonl").read_bytes()
     assert [line for line in lines if line.endswith(".log")] == [
         str(folder / "season" / f"{name}.log") for name in "abc"]

@@ -20,7 +20,7 @@ from level1.event import Event, Output
 from level1.io import definitions
 from level1.supervisor import Supervisor
 from ucs.main import main
-from ucs.simulate import SHIPPED, load
+from ucs.simulate import EXAMPLE, SHIPPED, load
 from ucs.simulated_unit import SimulatedUnit
 from ucs.tests.proof import proves
 
@@ -295,6 +295,12 @@ def test_each_shipped_scenario_runs_and_tells(name: str, capsys: pytest.CaptureF
     assert "× real time" in err
 
 
+def test_the_scenario_that_the_help_teaches_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "own.toml").write_text(EXAMPLE)
+    assert main(["simulate", str(tmp_path / "own.toml"), "--duration", "22 s"]) == 0
+    assert "pilot flame out: blown out" in capsys.readouterr().out
+
+
 def test_a_blown_out_flame_is_told_in_order(capsys: pytest.CaptureFixture[str]) -> None:
     main(["simulate", "windy.toml", "--duration", "15 s"])
     out = capsys.readouterr().out
@@ -329,7 +335,7 @@ def test_the_log_is_a_candump_file(tmp_path: Path) -> None:
     ([], "simulate needs a scenario"),
     (["windy.toml", "--duration", "soon"], "--duration: 'soon' should be a duration"),
     (["windy.toml", "--node", "flamr"], 'no node "flamr" in windy.toml; did you mean "flamer"?'),
-    (["windy.toml", "--log", "/nonexistent/out.log"], "/nonexistent/out.log: No such file or directory"),
+    (["windy.toml", "--log", "/nonexistent/out.log"], "/nonexistent/out.log: there is no folder /nonexistent"),
     (["windy.toml", "--bus", "nosuch0"], "bus nosuch0: th"),
     (["windy.toml", "--interface", "nosuch", "--channel", "1"], 'bus nosuch:1: no interface is called "nosuch"; known: '),
     (["windy.toml", "--bus", "vcan0", "--channel", "1"], "not both"),
