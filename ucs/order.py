@@ -12,6 +12,7 @@ from typing import Any
 
 from bridge.link import OrderEnd
 from bridge.wire import is_plain
+from level1.catalog import DefinitionError
 from level1.command import Order
 from level1.event import Result
 from level1.io import config, definitions
@@ -84,7 +85,10 @@ def _known(settings: config.Config, name: str, target: str, reason: str) -> str:
     unknown_alarm, unknown_order = reason.startswith("unknown alarm"), reason.startswith("unknown command")
     if not unknown_alarm and not unknown_order:
         return ""
-    catalog = definitions.load((), settings.bus_files, settings.bus_names)
+    try:
+        catalog = definitions.load((), settings.bus_files, settings.bus_names)
+    except DefinitionError:
+        return ""  # changed since the unit began: its answer stands all the same
     if unknown_alarm:
         close = did_you_mean(target, catalog.alarms)
         return close if "?" in close else "; `ucs alarms` lists those of a DBC file"

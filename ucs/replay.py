@@ -159,7 +159,7 @@ class _Out:
         self._standing.update(outcome.standing.keys())
 
     def totals(self) -> Iterator[str]:
-        """Each alarm's count over all recordings that other processes have done."""
+        """Each alarm's count over all recordings."""
         for alarm in sorted(self._with):
             stood = f"; still there at the end of {self._standing[alarm]}" if self._standing[alarm] else ""
             yield f"  {alarm:<28} {_counted(self._totals, alarm)} in {self._with[alarm]} of them{stood}"

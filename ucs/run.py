@@ -199,7 +199,8 @@ def _start_lines(settings: Config, catalog: Catalog) -> Iterator[str]:
     for bus in settings.bus:
         files = ", ".join(Path(name).name for name in bus.dbc) or "no definitions"
         nodes = ", ".join(f"{device.node}" for device in bus.canopen)
-        yield f"  bus {bus.name}: {bus.interface} {bus.channel} ({files}){f'; CANopen nodes {nodes}' if nodes else ''}"
+        alone = "; only this process hears it, udp_multicast reaches others" if bus.interface == "virtual" else ""
+        yield f"  bus {bus.name}: {bus.interface} {bus.channel} ({files}){f'; CANopen nodes {nodes}' if nodes else ''}{alone}"
     repairable = [name for name, alarm in catalog.alarms.items() if alarm.repair]
     armed = [name for name in repairable if name in settings.repairs.armed]
     passive = [name for name in repairable if name not in settings.repairs.armed]

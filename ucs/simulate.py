@@ -54,7 +54,7 @@ that one of your own can have:
 {EXAMPLE}
 Examples:
 
-  ucs simulate healthy.toml                            ten minutes of work in a moment
+  ucs simulate healthy.toml                            three minutes of work in a moment
   ucs simulate windy.toml --supervise --plot windy.png level 1 beside the nodes, and a picture of it
   ucs simulate windy.toml --bus vcan0                  in real time, for a `ucs run` on that bus
   ucs simulate windy.toml --interface udp_multicast --channel 239.74.163.2    the same without any CAN hardware
@@ -70,7 +70,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO.toml", help="the scenario to run")
     parser.add_argument("--list", action="store_true", help="show the shipped scenarios, programs, settings, orders and faults")
     parser.add_argument("--bus", metavar="NAME", help="SocketCAN interface, such as vcan0")
-    parser.add_argument("--interface", help="python-can interface (socketcan, virtual, udp_multicast, slcan, pcan, …)")
+    parser.add_argument("--interface", help="python-can interface (socketcan, udp_multicast, slcan, pcan, …; virtual ends at this "
+                        "process)")
     parser.add_argument("--channel", help="channel of the interface")
     parser.add_argument("--bitrate", type=int, help="bit/s, for interfaces that need it")
     parser.add_argument("--node", action="append", default=[], metavar="NAME", help="run only this node; may be repeated")

@@ -56,7 +56,8 @@ def test_an_alarm_is_told_repaired_stored_and_broadcast(unit: Path, capsys: pyte
     beside_run(unit, body)
     out = capsys.readouterr().out.splitlines()
     assert out[0] == "tractor-7 of fleet"
-    assert out[1] == "  bus implement: virtual test_run (flaming_tool.dbc)"
+    assert out[1] == ("  bus implement: virtual test_run (flaming_tool.dbc); only this process hears it, "
+                      "udp_multicast reaches others")
     assert re.match(r"  \d+ alarms; repairs armed: PilotFlameOut; passive: FlamingStartStopFailure, ", out[2])
     told = re.fullmatch(rf"boot (\d+), journal {re.escape(str(unit.parent / 'journal.db'))}; supervising", out[3])
     assert told

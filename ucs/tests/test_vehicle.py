@@ -474,7 +474,7 @@ def test_on_a_bus_its_sentences_go_to_a_serial_line_that_can_be_opened(tmp_path:
 @pytest.mark.parametrize(("name", "scenario", "error"), [
     ("new", "healthy.toml", "no node of this scenario has a GNSS receiver"),
     ("taken", "vehicle_healthy.toml", "there is something of that name already"),
-    ("no/such/folder", "vehicle_healthy.toml", "there is no folder ")])
+    ("no/such/folder", "vehicle_healthy.toml", "No such file or directory")])
 def test_a_line_that_can_not_be_made_is_one_line_and_code_2(tmp_path: Path, name: str, scenario: str, error: str,
                                                             capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "taken").touch()
