@@ -18,7 +18,9 @@ import pytest
 
 from hil_tests.vcan_run import INTERFACES
 from level1.decode import encode
+from level1.event import Event
 from level1.io.definitions import load
+from level1.io.journal import read_events
 
 ROOT = Path(__file__).parents[1]
 UCS = (sys.executable, "-m", "ucs")
@@ -40,12 +42,13 @@ class Line(NamedTuple):
 class Process:
     """A running program whose lines are collected. Made by the fixture `process`."""
 
-    def __init__(self, command: Sequence[str], name: str, cwd: Path, env: dict[str, str]):
+    def __init__(self, command: Sequence[str], name: str, cwd: Path):
         self.name, self.command = name, tuple(command)
         self.lines: list[Line] = []
         self._seen, self._open = 0, 2
         self._changed = threading.Condition()
         self._start_s = time.monotonic()
+        env = {**os.environ, "PYTHONUNBUFFERED": "1", "PYTHONPATH": os.pathsep.join((str(ROOT), *sys.path[1:]))}
         self._popen = subprocess.Popen(self.command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                                        stderr=subprocess.PIPE, cwd=cwd, env=env, text=True, errors="backslashreplace",
                                        start_new_session=True)
@@ -150,11 +153,10 @@ def process(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable
     does not end on SIGTERM fails the test. A failed test shows what each of them wrote, and when.
     """
     started: list[Process] = request.node.stash.setdefault(RUNNING, [])
-    env = {**os.environ, "PYTHONUNBUFFERED": "1", "PYTHONPATH": os.pathsep.join((str(ROOT), *sys.path[1:]))}
 
     def start(*arguments: str | Path, program: Sequence[str] = UCS, name: str = "", cwd: Path = tmp_path) -> Process:
         command = [*program, *map(str, arguments)]
-        started.append(Process(command, name or " ".join(command[len(program) - 1:][:2]), cwd, env))
+        started.append(Process(command, name or " ".join(command[len(program) - 1:][:2]), cwd))
         return started[-1]
 
     yield start
@@ -177,6 +179,11 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     if report.failed:
         report.sections += [(f"{one.name} (process {one.pid})", one.transcript) for one in item.stash.get(RUNNING, [])]
     return report
+
+
+def told(folder: Path, alarm: str) -> list[Event]:
+    """The events of an alarm in the journal of a run that has ended."""
+    return [event for event in read_events(folder / "journal.db", limit=10**6) if event.alarm == alarm]
 
 
 def lose_the_flame(run: Process, send: Callable[[int, bytes], object]) -> None:

@@ -1,7 +1,6 @@
 """What can befall a bus, on real SocketCAN: each its alarm within a second, over without a restart, told in the journal."""
 from __future__ import annotations
 
-import json
 import os
 import random
 import re
@@ -9,16 +8,14 @@ import signal
 import socket
 import struct
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from hil_tests.conftest import ROOT, SOON_S, START_S, Process, lose_the_flame
+from hil_tests.conftest import SOON_S, START_S, Process, lose_the_flame, told
 from level1.decode import encode, raw_of
 from level1.frame import ERROR, EXTENDED
 from level1.io.definitions import load
@@ -96,14 +93,6 @@ class Wire:
 
     def error(self, classes: int, controller: int = 0) -> None:
         self.send(ERROR | classes, bytes([0, controller, 0, 0, 0, 0, 0, 0]))
-
-
-def events(folder: Path) -> list[dict[str, Any]]:
-    """What the journal of a run that has ended tells."""
-    command = [sys.executable, "-m", "ucs", "journal", "unit.toml", "--format", "jsonl"]
-    written = subprocess.run(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True,
-                             capture_output=True, text=True).stdout
-    return [json.loads(line) for line in written.splitlines()]
 
 
 @pytest.mark.covers("CanBusDown", "raised", "cleared")
@@ -213,11 +202,11 @@ def test_plugs_pulled_a_hundred_times_leave_a_supervisor_that_works_and_a_journa
     with Wire() as wire:
         lose_the_flame(run, wire.send)
     assert run.stop() == 0
-    told = [event for event in events(tmp_path) if event["alarm"] == "CanBusDown"]
-    assert [event["event"] for event in told] == ["raised", "cleared"] * (len(told) // 2)
-    gaps = [(raised["t"] * 1e9, cleared["t"] * 1e9) for raised, cleared in zip(told[::2], told[1::2], strict=True)]
-    for raised, cleared in zip(told[::2], told[1::2], strict=True):
-        assert cleared["values"]["AwaySeconds"] == pytest.approx(cleared["t"] - raised["t"], abs=0.001)
+    events = told(tmp_path, "CanBusDown")
+    assert [event.event for event in events] == ["raised", "cleared"] * (len(events) // 2)
+    gaps = [(float(raised.t) * 1e9, float(cleared.t) * 1e9) for raised, cleared in zip(events[::2], events[1::2], strict=True)]
+    for raised, cleared in zip(events[::2], events[1::2], strict=True):
+        assert cleared.values["AwaySeconds"] == pytest.approx(float(cleared.t - raised.t), abs=0.001)
     for pulled, plugged in zip(pulled_ns, plugged_ns, strict=True):
         # Told while it is out or, when that was short, as soon as the bus's thread looks.
         assert any(begin <= plugged + 0.3e9 and end >= pulled for begin, end in gaps), "a pull that nobody was told of"

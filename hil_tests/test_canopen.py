@@ -1,10 +1,6 @@
 """CANopen on real SocketCAN: the air-blast sprayer's devices as processes, and nodes of the package `canopen` as peers."""
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +12,7 @@ import canopen
 import pytest
 
 import dbc
-from hil_tests.conftest import ROOT, SOON_S, START_S, Process
+from hil_tests.conftest import SOON_S, START_S, Process, told
 from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
@@ -91,14 +87,6 @@ def peer() -> Iterator[Peer]:
     one.network.disconnect()
 
 
-def journal(folder: Path, alarm: str) -> list[dict[str, Any]]:
-    """The events of an alarm, as `ucs journal` tells them."""
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), *sys.path[1:]))}
-    command = [sys.executable, "-m", "ucs", "journal", "unit.toml", "--alarm", alarm, "--format", "jsonl", "--values"]
-    told = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=True).stdout
-    return [json.loads(line) for line in told.splitlines()]
-
-
 @pytest.mark.covers("Ultrasonic3NotWorking", "raised", "repair_started", "repaired", "cleared")
 def test_a_dead_sensor_is_reset_by_nmt_and_verified_by_its_heartbeat(run: Process, simulate: Callable[..., Process]) -> None:
     sprayer = simulate("sprayer", "mission")
@@ -132,10 +120,10 @@ def test_a_device_that_dies_is_told_as_silent_and_cleared_when_it_is_back(
     simulate("sensors")
     run.expect("DeviceSilent +cleared", START_S)
     assert run.stop() == 0
-    events = journal(tmp_path, "DeviceSilent")
-    assert [event["event"] for event in events] == ["raised", "cleared"]
-    assert events[0]["values"]["LastState"] == "operational"
-    assert events[0]["text"] == "Ultrasonic sensors (node 43): no heartbeat for 1.75 s"
+    events = told(tmp_path, "DeviceSilent")
+    assert [event.event for event in events] == ["raised", "cleared"]
+    assert events[0].values["LastState"] == "operational"
+    assert events[0].text == "Ultrasonic sensors (node 43): no heartbeat for 1.75 s"
 
 
 @pytest.mark.covers("UltrasonicNotOperational", "raised", "repaired")
@@ -158,10 +146,10 @@ def test_emergencies_and_error_history_of_a_node_by_the_package(run: Process, pe
     device.emcy.reset()
     run.expect("DeviceEmergency +cleared", SOON_S)
     assert run.stop() == 0
-    raised, cleared = journal(tmp_path, "DeviceEmergency")
-    assert raised["values"]["ErrorRegister"] == "generic, voltage"
-    assert raised["values"]["MakerBytes"] == "0102030405"
-    assert cleared["values"]["ErrorHistory"] == "0x3120 0x8130", "read by SDO from the node"
+    raised, cleared = told(tmp_path, "DeviceEmergency")
+    assert raised.values["ErrorRegister"] == "generic, voltage"
+    assert raised.values["MakerBytes"] == "0102030405"
+    assert cleared.values["ErrorHistory"] == "0x3120 0x8130", "read by SDO from the node"
 
 
 class Guarded:
@@ -212,7 +200,7 @@ def test_a_guarded_device_is_asked_and_told_by_the_name_of_its_data_sheet_when_i
     finally:
         device.stop()
     assert started.stop() == 0
-    assert [event["text"] for event in journal(tmp_path, "DeviceSilent") if event["event"] == "raised"] == [
+    assert [event.text for event in told(tmp_path, "DeviceSilent") if event.event == "raised"] == [
         f"Old valve (node {GUARDED}): no answer to guarding for 0.85 s",
         f"Old valve (node {GUARDED}): no right answer to guarding (its toggle bit stands still) for 0.85 s"]
 

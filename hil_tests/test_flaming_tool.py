@@ -5,16 +5,14 @@ vcan1 the igniter is dead as well. One level 2 receives both. What was on the bu
 """
 from __future__ import annotations
 
-import os
 import re
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from hil_tests.conftest import ROOT, RUNNING, SOON_S, START_S, UCS, Process
+from hil_tests.conftest import RUNNING, SOON_S, START_S, UCS, Process
 from hil_tests.recorder import Recorder
 from level1.catalog import LOCKED_OUT, NORMAL, REPAIRING
 from level1.io.definitions import load
@@ -77,8 +75,7 @@ class Field:
 
     def start(self, *arguments: str) -> Process:
         """Start `ucs` with these arguments."""
-        env = {**os.environ, "PYTHONUNBUFFERED": "1", "PYTHONPATH": os.pathsep.join((str(ROOT), *sys.path[1:]))}
-        self.processes.append(Process([*UCS, *arguments], " ".join(arguments[:2]), self.folder, env))
+        self.processes.append(Process([*UCS, *arguments], " ".join(arguments[:2]), self.folder))
         return self.processes[-1]
 
     def close(self) -> list[str]:

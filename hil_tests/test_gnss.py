@@ -11,7 +11,7 @@ from pathlib import Path
 import can
 import pytest
 
-from hil_tests.conftest import SOON_S, START_S, Process
+from hil_tests.conftest import SOON_S, START_S, Process, told
 from level1.decode import Scale, raw_of
 from level1.io.definitions import load
 from level1.io.journal import read_events
@@ -115,7 +115,7 @@ def test_the_plug_is_pulled_and_put_in_again(run: Process, talker: Talker, tmp_p
         run.expect("gnss .*: back", SOON_S)
         run.expect("GnssNoData +cleared", SOON_S)
     assert run.stop() == 0
-    events = [event.event for event in read_events(tmp_path / "journal.db") if event.alarm == "GnssNoData"]
+    events = [event.event for event in told(tmp_path, "GnssNoData")]
     assert events == ["raised", "cleared"] * 3
 
 

@@ -8,7 +8,6 @@ the plug of the receiver have files of their own: their times are long, or someb
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from hil_tests.conftest import ROOT, RUNNING, START_S, UCS, Process
+from hil_tests.conftest import RUNNING, START_S, UCS, Process
 from hil_tests.recorder import Recorder
 from level1.catalog import ACTIVE, NORMAL, REPAIRING, Catalog
 from level1.event import Event
@@ -140,8 +139,7 @@ class Unit:
         return [event for event in of_alarm if event.instance == of_alarm[0].instance]
 
     def _start(self, *arguments: str) -> Process:
-        env = {**os.environ, "PYTHONUNBUFFERED": "1", "PYTHONPATH": os.pathsep.join((str(ROOT), *sys.path[1:]))}
-        self._started.append(Process([*UCS, *arguments], " ".join(arguments[:2]), self.folder, env))
+        self._started.append(Process([*UCS, *arguments], " ".join(arguments[:2]), self.folder))
         return self._started[-1]
 
 

@@ -8,9 +8,8 @@ from pathlib import Path
 import can
 import pytest
 
-from hil_tests.conftest import SOON_S, START_S, Process
+from hil_tests.conftest import SOON_S, START_S, Process, told
 from level1.io.definitions import load
-from level1.io.journal import read_events
 from level1.io.replay import Log
 from ucs.tests.units import unit_toml
 
@@ -80,6 +79,6 @@ def test_a_recorder_that_can_not_write_is_an_alarm_and_begins_anew_when_it_can(r
     run.expect("TrafficLogFailed +repaired", SOON_S)
     run.expect("TrafficLogFailed +cleared", SOON_S)
     assert run.stop() == 0
-    life = [event.event for event in read_events(tmp_path / "journal.db") if event.alarm == "TrafficLogFailed"]
+    life = [event.event for event in told(tmp_path, "TrafficLogFailed")]
     assert (life[:2], life[-2:]) == (["raised", "repair_started"], ["repaired", "cleared"])
     assert list((tmp_path / "traffic").glob("*.blf")) and list((tmp_path / "away").glob("*.blf"))

@@ -215,7 +215,7 @@ def test_level_2_is_told_whether_supervision_runs(unit: Unit, peer: Peer) -> Non
         peer.until(lambda: states(peer))
         assert not peer.messages(wire.Connection)[-1].supervising
         eventually(link.send_samples)
-        peer.until(lambda: peer.messages(wire.Connection)[-1].supervising)
+        peer.until(lambda: any(told.supervising for told in peer.messages(wire.Connection)))
         peer.until(lambda: not peer.messages(wire.Connection)[-1].supervising)
     link.close()
 
