@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
+from functools import cache
 from itertools import count
 from pathlib import Path
 from typing import IO, Literal, NamedTuple
@@ -17,6 +18,7 @@ from typing import IO, Literal, NamedTuple
 import pytest
 
 from hil_tests.vcan_run import INTERFACES
+from level1.catalog import Message
 from level1.decode import encode
 from level1.event import Event
 from level1.io.definitions import load
@@ -186,9 +188,15 @@ def told(folder: Path, alarm: str) -> list[Event]:
     return [event for event in read_events(folder / "journal.db", limit=10**6) if event.alarm == alarm]
 
 
+@cache
+def flamer_status() -> Message:
+    """The status of the flaming tool."""
+    return load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
+
+
 def lose_the_flame(run: Process, send: Callable[[int, bytes], object]) -> None:
     """What a flaming tool says whose pilot flame is out, until the unit has told it."""
-    status = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
+    status = flamer_status()
     end_s = time.monotonic() + SOON_S
     for times in count():
         if any(re.search("PilotFlameOut +raised", line) for line in run.out):

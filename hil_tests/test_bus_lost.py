@@ -8,8 +8,7 @@ from pathlib import Path
 import can
 import pytest
 
-from hil_tests.conftest import SOON_S, START_S, Process, lose_the_flame
-from level1.io.definitions import load
+from hil_tests.conftest import SOON_S, START_S, Process, flamer_status, lose_the_flame
 from ucs.tests.units import unit_toml
 
 pytestmark = pytest.mark.vcan
@@ -85,13 +84,13 @@ def test_a_missing_interface_and_one_that_is_down_say_what_to_do(
 @pytest.mark.parametrize("away", ["down", "deleted"])
 def test_nodes_on_a_bus_that_goes_away_survive_and_go_on_when_it_is_back(
         away: str, process: Callable[..., Process], set_link: Callable[[str, bool], None], remake: Callable[[], None]) -> None:
+    message = flamer_status()
     node = process("simulate", "healthy.toml", "--bus", "vcan0", "--duration", "1 min")
     node.expect("flaming on", START_S)
     set_link("vcan0", False) if away == "down" else remake()
     node.expect("bus vcan0 is lost .*the nodes live on and try again", SOON_S)
     set_link("vcan0", True) if away == "down" else remake()
     node.expect("bus vcan0 is back", SOON_S)
-    message = load(["flaming_tool.dbc"]).messages["FLAMER_STATUS"]
     with can.Bus(channel="vcan0", interface="socketcan", can_filters=[{"can_id": message.can_id, "can_mask": 0x7FF}]) as bus:
         assert bus.recv(SOON_S) is not None, "it sends again"
     assert node.stop() == 0
