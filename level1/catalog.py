@@ -121,7 +121,8 @@ class Alarm(msgspec.Struct, frozen=True):
     """An alarm: a signal of a message that the node `UCS` sends (DESIGN §3).
 
     when: raises it. until: clears it (None: not `when`). enabled: suppressed by design while FALSE (None: always enabled).
-    The texts as written stand beside the resolved conditions.
+    latch: it stays until acknowledged; local_latch: by someone at the machine, not from above. The texts as written stand beside
+    the resolved conditions.
     """
 
     name: str
@@ -137,6 +138,7 @@ class Alarm(msgspec.Struct, frozen=True):
     on_delay_ns: int = 0
     off_delay_ns: int = 0
     latch: bool = False
+    local_latch: bool = False
     cause: str = ""
     consequence: str = ""
     action: str = ""

@@ -567,13 +567,15 @@ class Supervisor:
         who = order.origin
         if order.name == "acknowledge" and not order.target:
             for alarm in self._machines():
-                if alarm.state != NORMAL:
+                if alarm.state != NORMAL and not (who == "above" and alarm.definition.local_latch):
                     alarm.acknowledge(self.now_ns, who)
             return ""
         machine = self._alarms.get(order.target)
         if machine is None:
             return f"unknown alarm {order.target}"
         if order.name == "acknowledge":
+            if who == "above" and machine.definition.local_latch:
+                return f"{order.target} can only be acknowledged at the machine"
             causes = list(self._reported[order.target].values())
             return " ".join(dict.fromkeys(cause.acknowledge(self.now_ns, who) for cause in causes or [machine])).strip()
         repair = machine.definition.repair

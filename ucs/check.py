@@ -125,7 +125,8 @@ def _row(alarm: Alarm) -> tuple[str, ...]:
 def _condition(alarm: Alarm) -> str:
     until = f"; until {alarm.until_text}" if alarm.until_text else ""
     enabled = f"; only while {alarm.enabled_text}" if alarm.enabled_text else ""
-    return f"{alarm.when_text}{until}{enabled}{'; latched' if alarm.latch else ''}"
+    latched = "; latched, acknowledged at the machine" if alarm.local_latch else "; latched" if alarm.latch else ""
+    return f"{alarm.when_text}{until}{enabled}{latched}"
 
 
 def _delays(alarm: Alarm) -> str:
@@ -148,7 +149,8 @@ def _as_object(alarm: Alarm) -> dict[str, Any]:
     return {
         "code": alarm.code, "name": alarm.name, "priority": alarm.priority, "message": alarm.message, "when": alarm.when_text,
         "until": alarm.until_text, "enabled_when": alarm.enabled_text, "on_delay_ms": alarm.on_delay_ns / 1_000_000,
-        "off_delay_ms": alarm.off_delay_ns / 1_000_000, "latch": alarm.latch, "cause": alarm.cause,
+        "off_delay_ms": alarm.off_delay_ns / 1_000_000, "latch": alarm.latch,
+        "local_latch": alarm.local_latch, "cause": alarm.cause,
         "consequence": alarm.consequence, "action": alarm.action, "comment": alarm.comment, "spn": alarm.spn, "fmi": alarm.fmi,
         "repair": repair, "file": alarm.file, "line": alarm.line}
 

@@ -136,7 +136,7 @@ def states_svg(alarm: Alarm) -> str:
     colour = COLOURS[alarm.priority]
     held = f"held {abbreviated(alarm.on_delay_ns)}" if alarm.on_delay_ns else "at once"
     calm = f"calm for {abbreviated(alarm.off_delay_ns)}" if alarm.off_delay_ns else "condition over"
-    last = ("and acknowledged",) if alarm.latch else ()
+    last = ("and acknowledged on board" if alarm.local_latch else "and acknowledged",) if alarm.latch else ()
     height = 84 if alarm.repair is None else 196
     parts = [f'<svg viewBox="0 0 680 {height}" role="img" aria-label="states">', _TIP, _box(6, 26, "Normal", "#2b8a3e"),
              _box(300, 26, "Active", colour), _arrow(124, 38, 300, 38, f"condition {held}"),

@@ -218,5 +218,6 @@ class Words:
         else:
             text = self.condition(alarm.until) if alarm.until is not None else self.condition(alarm.when, negated=True)
         held = f" for {duration(alarm.off_delay_ns)}" if alarm.off_delay_ns else ""
-        latch = " It stays until someone has acknowledged it." if alarm.latch else ""
+        where = " at the machine" if alarm.local_latch else ""
+        latch = f" It stays until someone{where} has acknowledged it." if alarm.latch else ""
         return f"It clears when {text}{held}.{latch}"

@@ -67,7 +67,8 @@ def _alarm(message: Message, signal: Signal, place: Place, scope: Scope) -> Alar
         priority=place.word("AlarmPriority", DEFAULT_PRIORITY), when=when, until=until, enabled=enabled,
         when_text=place.text("AlarmWhen"), until_text=place.text("AlarmUntil"), enabled_text=place.text("AlarmEnabledWhen"),
         on_delay_ns=numbers["AlarmOnDelay"] * MS, off_delay_ns=numbers["AlarmOffDelay"] * MS,
-        latch=place.word("AlarmLatch", "No") == "Yes", cause=place.text("AlarmCause"),
+        latch=place.word("AlarmLatch", "No") != "No", local_latch=place.word("AlarmLatch", "No") == "Local",
+        cause=place.text("AlarmCause"),
         consequence=place.text("AlarmConsequence"), action=place.text("AlarmAction"), comment=signal.comment,
         spn=spn if spn >= 0 else None, fmi=fmi if fmi >= 0 else None, repair=repair, file=place.path, line=place.line)
 

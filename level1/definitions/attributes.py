@@ -36,7 +36,7 @@ ATTRIBUTES: Mapping[str, AttributeSpec] = {
     "AlarmEnabledWhen": _TEXT,
     "AlarmOnDelay": _COUNT,
     "AlarmOffDelay": _COUNT,
-    "AlarmLatch": AttributeSpec("SG_", ("ENUM",), ("No", "Yes")),
+    "AlarmLatch": AttributeSpec("SG_", ("ENUM",), ("No", "Yes", "Local")),
     "AlarmCause": _TEXT,
     "AlarmConsequence": _TEXT,
     "AlarmAction": _TEXT,

@@ -92,6 +92,16 @@ def test_a_latched_alarm_waits_for_the_acknowledgement() -> None:
     assert events(outputs) == [(0.2, "Low", "acknowledged"), (0.2, "Low", "cleared")]
 
 
+def test_a_local_latch_is_lifted_at_the_machine_only() -> None:
+    target = supervisor([TANK], [alarm("Low", LOW, latch=True, local_latch=True)])
+    assert feed(target, (0, 10), (0.1, 50)) == [(0, "Low", "raised")]
+    named = target.command(Order("1", "acknowledge", "Low"), 200 * MS)
+    assert named == [Result("1", "refused", "Low can only be acknowledged at the machine")]
+    assert target.command(Order("2", "acknowledge"), 200 * MS) == [Result("2", "done")]
+    outputs = target.command(Order("3", "acknowledge", origin="local"), 300 * MS)
+    assert events(outputs) == [(0.3, "Low", "acknowledged"), (0.3, "Low", "cleared")]
+
+
 def test_acknowledged_before_it_clears_by_itself() -> None:
     target = supervisor([TANK], [alarm("Low", LOW, latch=True)])
     feed(target, (0, 10))

@@ -246,7 +246,7 @@ class TestEveryAlarm:
         player.play(values, 3 * SECOND).play(values, shipped().alarms[name].off_delay_ns + 40 * SECOND, quiet)
         if shipped().alarms[name].latch:
             assert [word for _, word in player.told()] == ["raised"]
-            player.take(player.target.command(Order("1", "acknowledge", name), player.now))
+            player.take(player.target.command(Order("1", "acknowledge", name, origin="local"), player.now))
         assert [word for _, word in player.told() if word != "acknowledged"][-1] == "cleared"
 
     @every(Elapsed)
