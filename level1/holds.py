@@ -93,7 +93,7 @@ class Holds:
                 hold.due = FAR
                 hold.before = self.last_command(hold.message.name)
                 hold.owner = owner
-        for loser in losers:
+        for loser in dict.fromkeys(losers):
             loser.taken(t_ns, owner.name)
         return ""
 

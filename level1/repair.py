@@ -154,8 +154,9 @@ class RepairMachine:
             self.consider(t_ns)
 
     def taken(self, t_ns: int, by: str) -> None:
-        """A repair of higher priority needs the message. A lock-out stays one, and takes it back when it is free."""
-        if self.alarm.state == LOCKED_OUT:
+        """A repair of higher priority needs the message. A lock-out stays one, and takes it back when it is free; an alarm that has
+        cleared meanwhile, by what another loser has set free, stays cleared."""
+        if self.alarm.state in (NORMAL, LOCKED_OUT):
             return
         if self.phase == RUNNING:
             self._report_failure(t_ns, f"{by} needs its command message")

@@ -556,3 +556,18 @@ def test_an_attempt_that_a_restart_ended_is_not_gone_on_with_where_the_repair_is
     successor.now, successor.flame = tool.now, 0
     assert words(successor.run(60)) == ["repair_started"] and sends(successor.outputs, "FLAMER_CMD") == []
     assert again.alarm_states()["PilotFlameOut"] == 1
+
+
+def test_an_alarm_that_clears_when_its_messages_are_taken_stays_cleared() -> None:
+    """The message that the other does not need is set free, which ends the episode: its other messages are taken after that."""
+    names = ("VALVES", "MORE", "THIRD")
+    messages = [VALVES, *(message(name, 0x403 + n, [signal("Set", 0, 8)], senders=("UCS",)) for n, name in enumerate(names[1:]))]
+    never = ExpectStep(compare("ACTUAL.Is", "==", 7), 5 * SECOND, "Is == 7")
+    target = supervisor([*messages, ACTUAL], [
+        alarm("Weak", compare("ACTUAL.Is", "==", 3), priority="Low",
+              repair=Repair((*(SendStep(name, {"Set": 1}) for name in names), never))),
+        alarm("Strong", compare("ACTUAL.Is", "==", 4), 2,
+              repair=Repair((*(SendStep(name, {"Set": 2}) for name in names[:2]), never)))])
+    outputs = [*_actual(target, 0, 10, 3), *_actual(target, 10, 12, 4)]
+    assert [word for _, name, word in events(outputs) if name == "Weak"] == ["raised", "repair_started", "repair_failed", "cleared"]
+    assert target.alarm_states() == {"Weak": 0, "Strong": 2}
