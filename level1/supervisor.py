@@ -554,7 +554,7 @@ class Supervisor:
         """Send a command's message; gives the reason of a refusal."""
         try:
             self.send(self.now_ns, command.message, self._command_payload(command, order), f"{COMMAND} {order.name}")
-        except (Refused, ValueError) as refusal:
+        except (Refused, ValueError, OverflowError) as refusal:  # an infinite value
             return str(refusal)
         return ""
 

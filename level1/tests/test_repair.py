@@ -571,3 +571,11 @@ def test_an_alarm_that_clears_when_its_messages_are_taken_stays_cleared() -> Non
     outputs = [*_actual(target, 0, 10, 3), *_actual(target, 10, 12, 4)]
     assert [word for _, name, word in events(outputs) if name == "Weak"] == ["raised", "repair_started", "repair_failed", "cleared"]
     assert target.alarm_states() == {"Weak": 0, "Strong": 2}
+
+
+@pytest.mark.parametrize("value", ["Infinity", "NaN", "300", "-1"])
+def test_a_value_that_no_signal_can_say_is_refused(value: str) -> None:
+    target = Supervisor(msgspec.structs.replace(catalog([STATUS, COMMAND], [pilot_flame_out()]), commands={
+        "turn_up": Command("turn_up", "FLAMER_CMD", {"Burner": None})}), unit="a", broadcast=False, start_ns=0)
+    (result,) = target.command(Order("x", "turn_up", value=Decimal(value)), 0)
+    assert isinstance(result, Result) and result.outcome == "refused"
