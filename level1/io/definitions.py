@@ -23,8 +23,9 @@ from level1.catalog import Catalog, DefinitionError, Problem
 
 MEMORY_LIMIT = 900_000_000
 """Bytes of address space of the child: an honest file of 100,000 lines takes half of it."""
-CPU_BASE_S, CPU_BYTES_PER_S = 8, 100_000
-"""Seconds of computing time of the child: a base, and one more for so many bytes. An honest file takes a fifth of that."""
+CPU_BASE_S, CPU_BYTES_PER_S = 20, 100_000
+"""Seconds of computing time of the child: a base, and one more for so many bytes. An honest file takes a tenth of that; a starved
+virtual machine counts what its host does meanwhile."""
 WALL_FACTOR = 6
 """The child may take so many times longer on a busy machine before it is given up."""
 MAX_FILE_BYTES = 10_000_000
