@@ -18,7 +18,8 @@ From the first attempt to the end of the episode the repair owns its command mes
 and the alarm signal on the bus reads Repairing, upon which other programs stop sending them. One message serves one repair at a
 time; an alarm of higher priority takes it from one of lower. A lock-out goes on holding those that are sent at a cycle time, also
 against attempts of its own priority. While nobody knows when the next attempt may begin (the unit is stopped, the feedback is
-missing), only a safe state is held; anything else is handed back: whoever commands may have other orders by now.
+missing), only a safe state is held; anything else ends as it was commanded before, and is handed back: whoever commands may have
+other orders by now.
 
 An attempt does not start (it waits) while its feedback is unknown, its message belongs to another, or the unit is stopped or
 paused from above. A repair that is not armed runs passive: it reports once for each activation what it would have sent.
@@ -305,7 +306,7 @@ class RepairMachine:
             return
         if self.definition.safe_between:
             self._safe_state(t_ns)
-        elif not self.host.forbidden(self.definition):
+        else:
             self.holds.restore(self, t_ns)
         self.phase = PAUSING
         if not self.definition.pause_ns:

@@ -68,9 +68,9 @@ class Work:
 
     def order(self, name: str, alarm: str = "", origin: Literal["local", "above"] = "above") -> str:
         """An order to level 1; gives why it was refused, or an empty string."""
-        outputs = self.supervisor.command(Order("1", name, alarm, origin=origin), self.simulation.now_ns)
-        self.outputs += outputs
-        return next(output.reason for output in outputs if isinstance(output, Result))
+        before = len(self.outputs)
+        self.unit.command(self.simulation.now_ns, Order("1", name, alarm, origin=origin))
+        return next(output.reason for output in self.outputs[before:] if isinstance(output, Result))
 
     @property
     def happened(self) -> list[Event]:
