@@ -236,6 +236,12 @@ def test_every_attribute_of_an_alarm_is_read() -> None:
     assert (built.file, built.line) == ("tool.dbc", line_of("SG_ FlameOut"))
 
 
+@pytest.mark.parametrize(("given", "latch", "local"), [(0, False, False), (1, True, False), (2, True, True), ("Local", True, True)])
+def test_a_latch_is_lifted_by_anybody_or_at_the_machine(given: int | str, latch: bool, local: bool) -> None:
+    built = alarm(AlarmLatch=given)
+    assert (built.latch, built.local_latch) == (latch, local)
+
+
 def test_what_is_not_given_has_its_default() -> None:
     built = alarm()
     assert (built.priority, built.until, built.enabled, built.on_delay_ns, built.off_delay_ns) == ("Medium", None, None, 0, 0)
