@@ -109,9 +109,9 @@ SPRAYER: Mapping[str, Row] = {
     "wrong counter": Row((SPRAYER_GARBLED,), ("SprayerFrozen",)),
     "wrong checksum": Row((SPRAYER_GARBLED,)),
     "babbling": Row((SPRAYER_STANDS,), ("SprayerCommandsLost", "SprayerDataCorrupt", "SprayingStartStopFailure")),
-    "silent": Row((SPRAYER_QUIET,), ("SprayerFrozen", "SprayerDataCorrupt")),
+    "silent": Row((SPRAYER_QUIET,)),
     "frozen": Row((SPRAYER_STANDS,), ("SprayerCommandsLost", "SprayerDataCorrupt", "SprayingStartStopFailure")),
-    "reset": Row((SPRAYER_QUIET,), ("SprayerCommandsLost", "SprayerDataCorrupt", "SprayingStartStopFailure", "SprayerFrozen")),
+    "reset": Row((SPRAYER_QUIET,), ("SprayerCommandsLost", "SprayingStartStopFailure")),
 }
 SPRAYER_MISSION: Mapping[str, Row] = {
     "silent": Row((SPRAYER_COMMANDS_LOST,)),

@@ -70,7 +70,7 @@ TRACTOR: Mapping[str, Row] = {
     "implement slow": Row((IMPLEMENT_WRONG,)),
     "gnss drifts": Row(),
     "babbling": Row(),
-    "wrong counter": Row((VEHICLE_MISCOUNTS,), DISOBEYED),
+    "wrong counter": Row((VEHICLE_MISCOUNTS,)),
     "pto refuses": Row((PTO_NOT_ON,), ("RearPtoNotEngaging",)),
     "pto stays on": Row((PTO_NOT_OFF,)),
     "implement refuses": Row((IMPLEMENT_WRONG,)),
