@@ -9,12 +9,15 @@ from level1.event import Event
 
 @dataclass
 class _Life:
-    """An alarm that was raised. repairs: attempt under way; attempt: number of the last one; good_s: when good ones began."""
+    """An alarm that was raised. repairs: attempt under way; attempt: number of the last one; good_s: when good ones began.
+    unlocked: a reset was accepted; it is forgotten when the cause comes back before the alarm has cleared.
+    """
 
     alarm: str
     keyed: bool
     repairs: bool = False
     locked: bool = False
+    unlocked: bool = False
     seen: bool = False
     attempt: int = 0
     good_s: list[float] = field(default_factory=list)
@@ -71,13 +74,13 @@ class Episodes:
             case "locked_out":
                 if life.repairs or life.locked:
                     self._mark(event, "an attempt is under way, or it is locked out already")
-                life.locked, life.seen = True, False
+                life.locked, life.unlocked, life.seen = True, False, False
             case "acknowledged":
                 life.seen = True
-                life.locked = life.locked and not event.text.startswith("reset")
+                life.unlocked |= event.text.startswith("reset")
             case "cleared":
                 latched = self._catalog.alarms[event.alarm].latch
-                if life.repairs or life.locked or latched and not life.seen:
+                if life.repairs or life.locked and not life.unlocked or latched and not life.seen:
                     self._mark(event, "a repair, a lock-out or a latch holds it")
                 self._give_back(event, life)
                 del self._lives[event.instance]

@@ -60,7 +60,8 @@ VEHICLE_COMMANDS_LOST = symptom("VehicleCommandsLost", 0.9, lambda w, n: w.tract
                                  and w.tractor.reason == "CommandsLost")
 
 DISOBEYED = ("HitchNotMoving", "PtoNotSet", "PtoNotUnset", "ImplementSetUnsetFailure", "RearPtoNotEngaging")
-"""A program that stands does not do what it is told meanwhile."""
+"""A program that stands does not do what it is told meanwhile. Nor is one obeyed that stands and goes on commanding On, Set and
+Move after the vehicle was taken over: it wants to hear Off, Unset and Hold first."""
 
 TRACTOR: Mapping[str, Row] = {
     "engine dies": Row((NOT_MOVING, FLAT), (), 60.0),
@@ -87,7 +88,7 @@ TRACTOR: Mapping[str, Row] = {
 }
 VEHICLE_MISSION: Mapping[str, Row] = {
     "silent": Row((VEHICLE_COMMANDS_LOST,)),
-    "frozen": Row((VEHICLE_COMMANDS_LOST,)),
+    "frozen": Row((VEHICLE_COMMANDS_LOST,), DISOBEYED),
     "reset": Row((VEHICLE_COMMANDS_LOST,)),
     "ignores repairs": Row(),
 }
