@@ -39,6 +39,8 @@ COMMAND_TIMEOUT_NS = 1_000_000_000
 """Five cycles of the commands of PTO, hitch and implement."""
 POSITION_TIMEOUT_NS = 1_000_000_000
 NOT_MOVING_NS = 10_000_000_000
+STOP_NS = 500_000_000
+"""A stop lasts so long at least: five messages tell of it, so that nobody goes on as if there had been none."""
 MOVES_M_S = 0.03
 IMPLEMENT_NS = 2_000_000_000
 SLOW, DRIFT_M_S = 3, 0.05
@@ -152,6 +154,7 @@ class Vehicle(Node):
         self._guide_counter: Value | None = None
         self._heard_as: dict[str, tuple[int, Mapping[str, Value]]] = {}
         self._released = dict.fromkeys(HARMLESS, False)
+        self._unstopped_ns = start_ns
         self._paused_from = "Ready"
         self._hitch_held = True
         self._drifts_ns: int | None = None
@@ -192,7 +195,7 @@ class Vehicle(Node):
                 self._ready()
             case "Resume", "Paused" if self._may_drive(t_ns):
                 self._execute(t_ns)
-            case "Resume", "Stopped" if self.reason == "Command":
+            case "Resume", "Stopped" if self.reason == "Command" and t_ns - self._unstopped_ns >= STOP_NS:
                 self._ready()
             case "Start", "Ready" if self.mission in ("Loaded", "Running") and self._may_drive(t_ns):
                 self.mission = "Running"
@@ -270,6 +273,8 @@ class Vehicle(Node):
                 self._pause("CommandsLost")
             elif t_ns - self._placed_ns >= POSITION_TIMEOUT_NS:
                 self._pause("PositionLost")
+        if self.controller != "Stopped":
+            self._unstopped_ns = t_ns
         if self.controller in HELD:
             self._released = dict.fromkeys(self._released, False)
 
@@ -488,7 +493,7 @@ class Vehicle(Node):
                 self.drive.fetch()
                 self.mission = "Loaded"
             case "start_button", "pressed":
-                if self.controller == "Stopped" and not self._pressed:
+                if self.controller == "Stopped" and not self._pressed and now_ns - self._unstopped_ns >= STOP_NS:
                     self._ready()
             case "", "manual":
                 if self.controller not in ("Disabled", "Stopped"):

@@ -186,6 +186,12 @@ def test_a_pressed_stop_switch_can_not_be_overruled() -> None:
     assert bench.kmh == pytest.approx(3)
 
 
+def test_a_stop_lasts_until_it_has_been_told() -> None:
+    bench = Bench().start().run(5).order("mission", "stop").run(0.1)
+    assert bench.break_("start_button", "pressed").run(0.2).vehicle.controller == "Stopped"
+    assert bench.run(0.5).break_("start_button", "pressed").run(0.2).vehicle.controller == "Ready"
+
+
 def test_a_pressed_stop_switch_is_stronger_than_a_stop_on_command_and_the_start_button() -> None:
     bench = Bench().start().run(5).order("mission", "stop").run(1).break_("stop_switch", "pressed").run(1)
     assert bench.says("VEHICLE_STATUS", "StopReason") == "Switch"

@@ -84,7 +84,7 @@ FLAMER: Mapping[str, Row] = {
     "flame_sensor stuck off": Row((FLAME_OUT, UNLIT), OUT, GAS_TAIL_S),
     "silent": Row((FLAMER_QUIET,), OUT),
     "frozen": Row((FLAMER_STANDS,), ("FlamerCommandsLost", "PilotIgnitionFailure", *OUT, *NOT_CONFIRMED, *JUST_CLOSED), GAS_TAIL_S),
-    "reset": Row((FLAMER_QUIET,), ("FlamerCommandsLost", *OUT), GAS_TAIL_S),
+    "reset": Row((FLAMER_QUIET,), ("FlamerCommandsLost", "PilotIgnitionFailure", *OUT), GAS_TAIL_S),
 }
 FLAMER_MISSION: Mapping[str, Row] = {
     "silent": Row((GAS_COMMANDS_LOST,), (*OUT, "PilotIgnitionFailure"), GAS_TAIL_S),
