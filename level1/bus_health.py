@@ -1,7 +1,7 @@
 """The health of one bus: its interface, its controller's error state, babbling identifiers, frames lost on the way in or out.
 
 Pure: it is told what happens and gives reports, causes of alarms of `ucs.dbc` that no condition raises (`Supervisor.report`).
-Each cause carries what was lost so far in its values; the last ones stand in its `cleared`.
+Each cause carries what was lost so far in its values; all that was lost while its alarm stood stands in its `cleared` (`Tolls`).
 
 Error message frames are those of Linux (linux/can/error.h). A controller that is bus-off takes no part in the traffic
 (ISO 11898-1): a frame that comes after proves that it is back, whatever the driver says or not.
@@ -36,6 +36,9 @@ ERROR_BURST = 10
 PACKETS = (0xEB00, 0xC700)
 """Parameter groups of the packets of the transport protocols (SAE J1939-21, ISO 11783-3)."""
 
+COSTS = ("Frames", "NotSent", "AwaySeconds")
+"""Values that count up: frames lost, frames not sent by message, seconds."""
+
 _BUS_OFF, _RESTARTED, _CONTROLLER, _NO_ACK = 0x40, 0x100, 0x4, 0x20
 _WARNING, _PASSIVE, _ACTIVE = 0x0C, 0x30, 0x40
 
@@ -51,24 +54,43 @@ class Report(NamedTuple):
     text: str
 
 
-class Outages:
-    """How long each bus was away, by the times that its events bear: the figure and they can't differ, however late the report
-    of a starved thread was heard."""
+class Tolls:
+    """What an alarm of a bus has cost: summed over all the time it stands, though its cause goes away and comes back within the
+    delay of clearing. `AwaySeconds`, how long a bus was away, is measured by the times that its events bear: the figure and they
+    can't differ, however late the report of a starved thread was heard."""
 
     def __init__(self) -> None:
         self._since_ns: dict[str, int] = {}
+        self._before: dict[tuple[str, str], dict[str, Any]] = {}
 
-    def measured(self, report: Report) -> Report:
-        """The same report, with `AwaySeconds` (to the millisecond) where a bus is back. Its t_ns: that of the event."""
+    def summed(self, report: Report, *, stands: bool) -> Report:
+        """The same report with all that was lost since the alarm was raised. Its t_ns: that of the event. stands: the alarm is
+        there from before."""
+        place = report.alarm, report.key
+        if not stands:
+            self._before.pop(place, None)
+        detail = {**report.detail, **self._away(report)}
+        for name, lost in self._before.get(place, {}).items():
+            detail[name] = _sum(lost, detail[name]) if name in detail else lost
+        if not report.present:
+            self._before[place] = {name: detail[name] for name in COSTS if name in detail}
+        return report._replace(detail=detail)
+
+    def _away(self, report: Report) -> dict[str, float]:
+        """To the millisecond, where a bus is back."""
         if report.alarm != DOWN:
-            return report
+            return {}
         if report.present:
             self._since_ns.setdefault(report.key, report.t_ns)
-            return report
+            return {}
         since_ns = self._since_ns.pop(report.key, None)
         if since_ns is None:  # lost in another boot, whose time line is over
-            return report
-        return report._replace(detail={**report.detail, "AwaySeconds": round((report.t_ns - since_ns) / 1e9, 3)})
+            return {}
+        return {"AwaySeconds": round((report.t_ns - since_ns) / 1e9, 3)}
+
+
+def _sum(before: Any, lost: Any) -> Any:
+    return dict(Counter(before) + Counter(lost)) if isinstance(before, dict) else round(before + lost, 3)
 
 
 class Traffic(NamedTuple):

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 
+import grimp
 import msgspec
 
 from benchmarks.season import oracle
@@ -21,11 +21,10 @@ from benchmarks.season.runner import Job, planned
 from firmware_py.scenario import PROGRAMS
 
 ROOT = Path(__file__).parents[2]
-CODE = ("level1", "firmware_py", "dbc", "benchmarks/season", "ucs/simulated_unit.py")
-NOT_RUN = ROOT / "level1" / "io"
-"""What touches the world; in virtual time nothing of it is used, but for what reads the definitions."""
-KINDS = (".py", ".dbc", ".eds", ".lark")
-_IMPORT = re.compile(r"^from firmware_py\.(\w+) import", re.MULTILINE)
+PACKAGES = ("benchmarks", "dbc", "firmware_py", "level1", "ucs")
+DAY = "benchmarks.season.runner"
+"""The module that runs a day: what it does not import, directly or by others, has no part in it."""
+DATA = ("dbc/*.dbc", "dbc/*.eds", "level1/*.lark")
 
 
 class Kept:
@@ -74,28 +73,30 @@ def code_hash(machine: str) -> str:
 
 @cache
 def _all_files() -> tuple[Path, ...]:
-    paths = [ROOT / place for place in CODE]
-    files = sorted(file for path in paths for file in (path.rglob("*") if path.is_dir() else [path]))
-    return tuple(file for file in files if file.suffix in KINDS and "tests" not in file.parts
-                 and (file.parent != NOT_RUN or file.name == "definitions.py"))
+    data = {file for kind in DATA for file in ROOT.glob(kind)}
+    return tuple(sorted(data.union(_files(_graph().find_upstream_modules(DAY) | {DAY}))))
 
 
 @cache
 def _files_of(program: str) -> frozenset[Path]:
     """What a program's node is made of, its definitions, and what the judge knows of it."""
     kind = PROGRAMS[program]
-    modules = set(_imported(kind.__module__.rpartition(".")[2]))
+    modules = {kind.__module__} | {module for module in _graph().find_upstream_modules(kind.__module__)
+                                   if module.startswith("firmware_py.")}
     definitions = {ROOT / "dbc" / name for name in (kind.DBC, *kind.MORE_DBC) if name != "ucs.dbc"}  # that is everybody's
     judge = {Path(module.__file__ or "") for module in oracle.PARTS if program in module.ROWS}
-    return frozenset({ROOT / "firmware_py" / f"{module}.py" for module in modules} | definitions | judge)
+    return frozenset({*_files(modules), *definitions, *judge})
 
 
-def _imported(module: str, seen: frozenset[str] = frozenset()) -> Iterator[str]:
-    """A module of firmware_py and those that it imports."""
-    yield module
-    names = set(_IMPORT.findall((ROOT / "firmware_py" / f"{module}.py").read_text(encoding="utf-8"))) - seen - {module}
-    for name in names:
-        yield from _imported(name, seen | {module} | names)
+@cache
+def _graph() -> grimp.ImportGraph:
+    return grimp.build_graph(*PACKAGES, cache_dir=None)
+
+
+def _files(modules: Iterable[str]) -> Iterable[Path]:
+    for module in modules:
+        path = ROOT / module.replace(".", "/")
+        yield path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
 def cache_folder() -> Path:

@@ -21,7 +21,7 @@ from typing import Protocol
 import msgspec
 
 from level1 import bus_health, health
-from level1.bus_health import Outages, Report
+from level1.bus_health import Report, Tolls
 from level1.command import Order
 from level1.event import Commanded, Event, Monitor, Output, Result, Send, SentFrame, seconds
 from level1.frame import BUS_SHIFT, EXTENDED, Row
@@ -147,7 +147,7 @@ class Live:
         self._missing_ns: int | None = None
         self._addresses: dict[int, int] = {}
         self._begun = False
-        self._outages = Outages()
+        self._tolls = Tolls()
         for port in ports:
             self._listen(port)
 
@@ -260,10 +260,11 @@ class Live:
     def _tell(self, report: Report) -> Sequence[Output]:
         """A cause of an alarm that no condition raises, at its time, or, heard late, at the time that supervision has come to."""
         supervisor = self.supervisor
-        t_ns, alarm, key, present, detail, text = self._outages.measured(
-            report._replace(t_ns=max(report.t_ns, supervisor.now_ns)))
-        outputs = list(supervisor.tick(t_ns))
-        if present or key in supervisor.causes(alarm):
+        report = report._replace(t_ns=max(report.t_ns, supervisor.now_ns))
+        outputs = list(supervisor.tick(report.t_ns))
+        stands = report.key in supervisor.causes(report.alarm)
+        t_ns, alarm, key, present, detail, text = self._tolls.summed(report, stands=stands)
+        if present or stands:
             supervisor.report(t_ns, alarm, key, True, detail, text)
         supervisor.report(t_ns, alarm, key, present, detail, text)
         supervisor.board.settle(t_ns)

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from level1.bus_health import ALARMS, ERROR_BURST, QUIET_WINDOWS, WINDOW_NS, BusHealth, Outages, Report, Traffic
+from level1.bus_health import ALARMS, ERROR_BURST, QUIET_WINDOWS, WINDOW_NS, BusHealth, Report, Tolls, Traffic
 from level1.event import Event
 from level1.frame import EXTENDED
 from level1.io.definitions import load
@@ -60,28 +60,49 @@ class TestInterface:
         assert brief(bus.up(3 * S)) == [("CanBusOff", "implement", False), ("CanBusDown", "implement", False)]
 
 
-class TestOutages:
+class TestTolls:
     def down(self, t_ns: int, present: bool, bus: str = "implement") -> Report:
         return Report(t_ns, "CanBusDown", bus, present, {"Bus": bus}, "")
 
+    def unsent(self, present: bool, not_sent: dict[str, int]) -> Report:
+        return Report(S, "SendFailed", "implement", present, {"Bus": "implement", "NotSent": not_sent}, "")
+
     def test_a_bus_was_away_from_when_it_was_first_told_lost_until_it_was_told_back(self) -> None:
-        outages = Outages()
-        for t_ns in (1_000 * S, 1_001 * S):
-            assert outages.measured(self.down(t_ns, True)) == self.down(t_ns, True)
-        outages.measured(self.down(1_002 * S, True, "tractor"))
-        back = outages.measured(self.down(1_002 * S + 345_678_901, False))
+        tolls = Tolls()
+        for t_ns, stands in ((1_000 * S, False), (1_001 * S, True)):
+            assert tolls.summed(self.down(t_ns, True), stands=stands) == self.down(t_ns, True)
+        tolls.summed(self.down(1_002 * S, True, "tractor"), stands=False)
+        back = tolls.summed(self.down(1_002 * S + 345_678_901, False), stands=True)
         assert back.detail == {"Bus": "implement", "AwaySeconds": 2.346}
-        assert outages.measured(self.down(1_003 * S, False, "tractor")).detail["AwaySeconds"] == 1
-        outages.measured(self.down(1_010 * S, True))
-        assert outages.measured(self.down(1_011 * S, False)).detail["AwaySeconds"] == 1, "each outage for itself"
+        assert tolls.summed(self.down(1_003 * S, False, "tractor"), stands=True).detail["AwaySeconds"] == 1
+        tolls.summed(self.down(1_010 * S, True), stands=False)
+        assert tolls.summed(self.down(1_011 * S, False), stands=True).detail["AwaySeconds"] == 1, "each alarm for itself"
 
     def test_of_one_that_was_lost_in_another_boot_nobody_knows(self) -> None:
-        assert Outages().measured(self.down(S, False)) == self.down(S, False)
+        assert Tolls().summed(self.down(S, False), stands=True) == self.down(S, False)
+
+    def test_a_cause_that_comes_back_before_its_alarm_has_cleared_adds_to_what_was_lost_before(self) -> None:
+        tolls = Tolls()
+        tolls.summed(self.unsent(True, {"CMD": 2, "ALARMS": 1}), stands=False)
+        assert tolls.summed(self.unsent(False, {"CMD": 3, "ALARMS": 1}), stands=True).detail["NotSent"] == {"CMD": 3, "ALARMS": 1}
+        for not_sent, total in (({"CMD": 1}, 4), ({"CMD": 5}, 8)):
+            summed = tolls.summed(self.unsent(True, not_sent), stands=True)
+            assert summed.detail == {"Bus": "implement", "NotSent": {"CMD": total, "ALARMS": 1}}
+        assert tolls.summed(self.unsent(False, {"CMD": 5}), stands=True).detail["NotSent"] == {"CMD": 8, "ALARMS": 1}
+        assert tolls.summed(self.unsent(True, {"CMD": 5}), stands=False).detail["NotSent"] == {"CMD": 5}, "each alarm for itself"
+
+    def test_two_outages_of_one_alarm_are_summed_and_what_could_not_be_sent_in_one_of_them_is_kept(self) -> None:
+        tolls = Tolls()
+        tolls.summed(self.down(S, True), stands=False)
+        tolls.summed(self.down(2 * S, False)._replace(detail={"Bus": "implement", "NotSent": {"CMD": 1}}), stands=True)
+        tolls.summed(self.down(4 * S, True), stands=True)
+        assert tolls.summed(self.down(7 * S, False), stands=True).detail == {
+            "Bus": "implement", "AwaySeconds": 4, "NotSent": {"CMD": 1}}
 
     def test_other_causes_are_left_alone(self, bus: BusHealth) -> None:
-        outages = Outages()
+        tolls = Tolls()
         reports = [*bus.error(S, BUS_OFF, bytes(8)), *bus.heard(2 * S)]
-        assert [outages.measured(report) for report in reports] == reports
+        assert [tolls.summed(report, stands=False) for report in reports] == reports
 
 
 class TestController:

@@ -693,6 +693,16 @@ class TestLive:
         assert (float(raised.t), float(cleared.t)) == (raised_s, 2.6)
         assert cleared.values["AwaySeconds"] == round(float(cleared.t - raised.t), 3)
 
+    def test_all_that_was_not_sent_while_the_alarm_stood_stands_in_its_clearing(self, own: Catalog) -> None:
+        unit = Unit(own)
+        for ms, present, lost in ((1_000, True, 2), (1_500, False, 3), (2_000, True, 1), (2_750, False, 4)):  # clears after 2 s
+            detail = {"Bus": "implement", "NotSent": {"CMD": lost}}
+            unit.inbox.report([Report(ms * MS, "SendFailed", "implement", present, detail, "")])
+            unit.turn_at(ms + 3)
+        unit.turn_at(5_000)
+        raised, cleared = (event for kind, event in (entry for entry in unit.log if entry[0] == "told"))
+        assert (raised.values["NotSent"], cleared.values["NotSent"]) == ({"CMD": 2}, {"CMD": 7})
+
     def test_dropped_frames_are_an_alarm_that_counts_them(self, own: Catalog) -> None:
         unit = Unit(own)
         unit.turn_at(1_000)
