@@ -1,7 +1,8 @@
 """The short way between `ucs run` and the bridge on the same machine: two datagram sockets beside the journal.
 
 Best effort by design: what must not be lost is in the journal, and neither process ever waits for the other. `ucs run`
-makes a `RunLink`, the bridge a `BridgeLink`; either may start first, end, and start again.
+makes a `RunLink`, the bridge a `BridgeLink`; either may start first, end, and start again. Where the disk has no room for a
+socket `ucs run` goes on without, and makes it later (`ready`).
 
     run → bridge   Poke       the journal has news (it is looked at every 50 ms anyhow)
                    Samples    the latest monitoring messages; also the sign that supervision is alive
@@ -15,6 +16,7 @@ from __future__ import annotations
 import os
 import socket
 from collections import deque
+from contextlib import suppress
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -23,6 +25,7 @@ import msgspec
 from bridge.wire import is_plain
 from level1.command import Order
 from level1.event import Event, Monitor, Result
+from level1.io import local_socket
 
 DATAGRAM_BYTES = 100_000
 """A Unix datagram may have about 200 kB."""
@@ -75,23 +78,36 @@ _encoder = msgspec.json.Encoder(decimal_format="number")
 
 
 class _End(Generic[T]):
-    """One end: receives at its own socket, sends to the other's, which may not be there."""
+    """One end: receives at its own socket, sends to the other's, which may not be there. Nothing comes or goes until `ready`.
 
-    def __init__(self, journal: Path, own: str, other: str, decoder: msgspec.json.Decoder[T]):
+    patient: it may become ready later; else it raises OSError where the folder can't be written.
+    """
+
+    def __init__(self, journal: Path, own: str, other: str, decoder: msgspec.json.Decoder[T], *, patient: bool):
         self.malformed = 0
         self._decoder = decoder
         self._name, self._other = _name(journal, own), _name(journal, other)
-        # by the folder's descriptor: a socket's path has 107 bytes at most, a journal's has not
-        self._folder = os.open(journal.absolute().parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        self._place = journal.absolute().parent
+        self._folder = -1
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        os.fchmod(self._socket.fileno(), 0o600)  # orders come this way
         try:
-            os.fchmod(self._socket.fileno(), 0o600)  # orders come this way
-            self._unlink()
-            self._socket.bind(self._path(self._name))
-        except BaseException:
-            self._socket.close()
-            os.close(self._folder)
-            raise
+            self._open()
+        except OSError:
+            if not patient:
+                self._socket.close()
+                raise
+
+    def _open(self) -> None:
+        self._folder = local_socket.bind(self._socket, self._place, self._name)
+
+    @property
+    def ready(self) -> bool:
+        """Whether it is open; tries to open it where it is not."""
+        if self._folder < 0:
+            with suppress(OSError):
+                self._open()
+        return self._folder >= 0
 
     def fileno(self) -> int:
         """Readable when something came."""
@@ -118,39 +134,30 @@ class _End(Generic[T]):
 
     def close(self) -> None:
         """Close the socket and remove it from the folder."""
-        self._unlink()
         self._socket.close()
-        os.close(self._folder)
+        if self._folder >= 0:
+            local_socket.unbind(self._folder, self._name)
 
     def _send(self, message: msgspec.Struct) -> bool:
         """Whether the other end's socket took it."""
         datagram = _encoder.encode(message)
-        if len(datagram) > DATAGRAM_BYTES:
+        if len(datagram) > DATAGRAM_BYTES or self._folder < 0:
             return False
         try:
-            self._socket.sendto(datagram, self._path(self._other))
+            self._socket.sendto(datagram, local_socket.name_in(self._folder, self._other))
             return True
         except OSError:
             return False
 
-    def _path(self, name: str) -> str:
-        return f"/proc/self/fd/{self._folder}/{name}"
-
-    def _unlink(self) -> None:
-        try:
-            os.unlink(self._name, dir_fd=self._folder)
-        except OSError:
-            pass
-
 
 class RunLink(_End[FromBridge]):
-    """The end of `ucs run`. Raises OSError where the folder can't be written.
+    """The end of `ucs run`.
 
     refusals: told by the gate and not yet taken, the newest `REFUSALS`.
     """
 
     def __init__(self, journal: Path):
-        super().__init__(journal, "run", "bridge", msgspec.json.Decoder(FromBridge))
+        super().__init__(journal, "run", "bridge", msgspec.json.Decoder(FromBridge), patient=True)
         self.refusals: deque[Refusal] = deque(maxlen=REFUSALS)
 
     def receive(self) -> list[Instruct]:
@@ -180,7 +187,7 @@ class BridgeLink(_End[FromRun]):
     """The bridge's end. Raises OSError where the folder can't be written."""
 
     def __init__(self, journal: Path):
-        super().__init__(journal, "bridge", "run", msgspec.json.Decoder(FromRun))
+        super().__init__(journal, "bridge", "run", msgspec.json.Decoder(FromRun), patient=False)
 
     def receive(self) -> list[FromRun]:
         """What came."""
@@ -196,10 +203,10 @@ class BridgeLink(_End[FromRun]):
 
 
 class LocalEnd(_End[Instruct]):
-    """Where `ucs run` hears someone at the machine: a socket of its own, which a bridge need not reach. Raises OSError."""
+    """Where `ucs run` hears someone at the machine: a socket of its own, which a bridge need not reach."""
 
     def __init__(self, journal: Path):
-        super().__init__(journal, "local", "order", msgspec.json.Decoder(Instruct))
+        super().__init__(journal, "local", "order", msgspec.json.Decoder(Instruct), patient=True)
 
     def receive(self) -> list[Instruct]:
         """The orders that came."""
@@ -214,7 +221,7 @@ class OrderEnd(_End[Answer]):
     """The end of someone at the machine. Raises OSError where the folder can't be written."""
 
     def __init__(self, journal: Path):
-        super().__init__(journal, "order", "local", msgspec.json.Decoder(Answer))
+        super().__init__(journal, "order", "local", msgspec.json.Decoder(Answer), patient=False)
 
     def instruct(self, order: Order) -> bool:
         """Hand over an order; False when `ucs run` isn't there."""

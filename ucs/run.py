@@ -21,7 +21,7 @@ from level1.io.canopen import HistoryReader, devices
 from level1.io.config import Config
 from level1.io.error import OutsideError
 from level1.io.inbox import Inbox
-from level1.io.journal import FIRST, Journal, Reader
+from level1.io.journal import FIRST, Journal, JournalError, Reader
 from level1.io.live import Live, decode_state, encode_state
 from level1.io.systemd import Supervised
 from level1.memory import AlarmMemory, State
@@ -93,8 +93,10 @@ def run(args: Namespace) -> int:
         for port in ports:
             port.start()
             stack.callback(port.stop)
-        journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name, new_boot=_first_boot(),
+        journal = stack.enter_context(Journal(Path(settings.journal.path), settings.unit.name, least_boot=_least_boot(),
                                               monitor_bytes=settings.journal.monitor_mb * 1_000_000))
+        if journal.waits:
+            inbox.notice(f"{journal.fault}: supervising, with the events in memory until it can")
         uplink = stack.enter_context(Uplink(journal, inbox, time.monotonic_ns))
         sources = readings.start(settings, catalog, ports, journal, inbox, stack)
         service = Supervised()
@@ -116,8 +118,8 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def _first_boot() -> int:
-    """The boot id for a unit that finds no trace of an earlier journal: with an exchanged card it must not begin at 1 again."""
+def _least_boot() -> int:
+    """Boot ids below this are past: with an exchanged card, or one that can't be read, a unit must not begin at 1 again."""
     now_s = int(time.time())
     return now_s if now_s > PLAUSIBLE_S else 1
 
@@ -145,8 +147,7 @@ def restored(journal: Journal, notice: Callable[[str], None]) -> State | None:
     """
     stored = journal.restored_state()
     if journal.state_lost:
-        with Reader(journal.path) as reader:
-            state = State("stopped", lock_outs(reader))
+        state = State("stopped", _lock_outs_of(journal))
         notice("the journal gave back no state: nobody knows whether the unit was stopped, so it begins as stopped; "
                "after a look at the machine: ucs order unit.toml resume")
         journal.append((), encode_state(state))
@@ -159,6 +160,15 @@ def restored(journal: Journal, notice: Callable[[str], None]) -> State | None:
     except msgspec.DecodeError as error:
         raise OutsideError(f"journal {journal.path}: its latches and lock-outs can't be read ({error}); see to what was locked "
                            "out, then set another [journal] path") from None
+
+
+def _lock_outs_of(journal: Journal) -> tuple[AlarmMemory, ...]:
+    """None where it can't be read."""
+    try:
+        with Reader(journal.path) as reader:
+            return lock_outs(reader)
+    except JournalError:
+        return ()
 
 
 def lock_outs(reader: Reader) -> tuple[AlarmMemory, ...]:

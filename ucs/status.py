@@ -226,8 +226,8 @@ def judge(picture: Picture, limits: Limits) -> list[Finding]:
 def _judge_run(picture: Picture) -> Iterator[Finding]:
     run = picture.run
     if run is None:
-        denied = picture.run_silent == Silence.DENIED.value
-        yield Finding(UNKNOWN if denied else CRITICAL, f"`ucs run` {picture.run_silent}")
+        unknown = picture.run_silent in (Silence.DENIED.value, Silence.CUT_OFF.value)
+        yield Finding(UNKNOWN if unknown else CRITICAL, f"`ucs run` {picture.run_silent}")
         return
     if run.turn_age_s > HANGS_S:
         yield Finding(CRITICAL, f"supervision hangs for {roughly(run.turn_age_s)}")

@@ -23,6 +23,8 @@ BESIDE_NS = 2_000_000_000
 
 COMMAND_REFUSED = "CommandRefused"
 """Alarm of `ucs.dbc` whose causes are commands that the gate has refused."""
+RETRY_S = 1.0
+"""So often a socket is tried again for which the disk had no room."""
 PRUNE_S = 60.0
 """So often the journal learns what level 2 has, and may shrink to its bound."""
 
@@ -73,7 +75,8 @@ class Uplink:
     def _listen(self) -> None:
         """Orders, until the end; and now and then what level 2 has acknowledged."""
         while True:
-            readable, _, _ = select.select([self._link.fileno(), self._local.fileno(), self._wake], [], [], PRUNE_S)
+            patience_s = PRUNE_S if self._link.ready and self._local.ready else RETRY_S
+            readable, _, _ = select.select([self._link.fileno(), self._local.fileno(), self._wake], [], [], patience_s)
             if self._wake in readable:
                 return
             # where an order came in says who gave it, whatever it says itself

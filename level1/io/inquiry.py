@@ -14,7 +14,10 @@ from contextlib import suppress
 from enum import Enum
 from pathlib import Path
 
+from level1.io import local_socket
+
 PATIENCE_S = 1.0
+RETRY_S = 1.0
 PAUSE_S = 0.02
 """After each answer: nobody gets more than fifty a second out of it."""
 CHUNK = 1 << 16
@@ -28,30 +31,22 @@ class Silence(Enum):
     ABSENT = "is not running"
     DENIED = "can't be asked by this user"
     MUTE = "runs but does not answer"
+    CUT_OFF = "can't be asked if it runs: the disk of its journal is read-only"
 
 
 class Desk:
-    """Answers whoever asks; a context manager. who: `run` or `bridge`. Raises OSError where the folder can't be written.
+    """Answers whoever asks; a context manager. who: `run` or `bridge`. A folder that can't be written is tried again.
 
     answer: called in the desk's thread for every question.
     """
 
     def __init__(self, journal: Path, who: str, answer: Callable[[], bytes]):
         self._answer = answer
-        self._name = _name(journal, who)
-        # by the folder's descriptor: a socket's path has 107 bytes at most, a journal's has not
-        self._folder = os.open(journal.absolute().parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        self._place, self._name = journal.absolute().parent, _name(journal, who)
+        self._folder = -1
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            self._unlink()
-            path = f"/proc/self/fd/{self._folder}/{self._name}"
-            self._socket.bind(path)
-            os.chmod(path, 0o666)
-            self._socket.listen(4)
-        except BaseException:
-            self._socket.close()
-            os.close(self._folder)
-            raise
+        self._ended = threading.Event()
+        self._open()  # now, where it can be: whoever starts us may ask at once
         self._thread = threading.Thread(target=self._serve, name=f"desk of {who}", daemon=True)
         self._thread.start()
 
@@ -59,16 +54,29 @@ class Desk:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._unlink()
+        self._ended.set()
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._thread.join(2 * PATIENCE_S)
         self._socket.close()
-        os.close(self._folder)
+        if self._folder >= 0:
+            local_socket.unbind(self._folder, self._name)
+
+    def _open(self) -> bool:
+        """Whether there is a socket for those who ask now."""
+        try:
+            self._folder = local_socket.bind(self._socket, self._place, self._name)
+        except OSError:
+            return False
+        os.chmod(local_socket.name_in(self._folder, self._name), 0o666)
+        self._socket.listen(4)
+        return True
 
     def _serve(self) -> None:
-        pause = threading.Event()
-        while True:
+        while self._folder < 0 and not self._open():
+            if self._ended.wait(RETRY_S):
+                return
+        while not self._ended.is_set():
             try:
                 client, _ = self._socket.accept()
             except OSError:
@@ -76,17 +84,13 @@ class Desk:
             with client, suppress(OSError):
                 client.settimeout(PATIENCE_S)
                 client.sendall(self._answer())
-            pause.wait(PAUSE_S)
-
-    def _unlink(self) -> None:
-        with suppress(OSError):
-            os.unlink(self._name, dir_fd=self._folder)
+            self._ended.wait(PAUSE_S)
 
 
 def ask(journal: Path, who: str, patience_s: float = 3 * PATIENCE_S) -> bytes | Silence:
     """The answer of the process that serves a journal, or why there is none."""
     try:
-        folder = os.open(journal.absolute().parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        folder = local_socket.open_folder(journal.absolute().parent)
     except PermissionError:
         return Silence.DENIED
     except OSError:
@@ -94,14 +98,14 @@ def ask(journal: Path, who: str, patience_s: float = 3 * PATIENCE_S) -> bytes | 
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
             asking.settimeout(patience_s)
-            asking.connect(f"/proc/self/fd/{folder}/{_name(journal, who)}")
+            asking.connect(local_socket.name_in(folder, _name(journal, who)))
             return _whole(asking)
     except PermissionError:
         return Silence.DENIED
     except (TimeoutError, BlockingIOError):
         return Silence.MUTE
     except OSError:
-        return Silence.ABSENT
+        return Silence.CUT_OFF if os.fstatvfs(folder).f_flag & os.ST_RDONLY else Silence.ABSENT
     finally:
         os.close(folder)
 

@@ -4,8 +4,8 @@ SQLite in WAL mode with `synchronous=FULL`: a commit survives the power cut righ
 by one thread; readers have read-only connections of their own and disturb nobody.
 
 The thread is there for slow disks: `append` waits for the commit as long as `patience_ns`, then supervision goes on and
-the events wait in memory. The same holds for a full, read-only or broken disk: `fault` says so, the thread tries again,
-and what waited is written in order as soon as it can be. Nothing here raises for disk trouble after the opening.
+the events wait in memory. The same holds for a full, read-only or broken disk, also one that was so before the opening: `fault`
+says so, the thread tries again, and what waited is written in order as soon as it can be. Nothing here raises for disk trouble.
 
 Beside `journal.db` stand `journal.db.boot` (the boot id, in case the journal is lost), `journal.db.ballast` (space for
 alarms on a full disk), `journal.db.lock` (one writer) and `journal.db.monitor` (the monitoring history, see `journal_monitor`).
@@ -29,6 +29,7 @@ from level1.io.ballast import Ballast
 from level1.io.bootfile import BootFile
 from level1.io.journal_file import (
     FIRST,
+    DiskError,
     JournalError,
     JournalFile,
     Position,
@@ -63,19 +64,22 @@ Commands = Sequence[tuple[int, Commanded]]
 
 
 class Journal:
-    """The writer's side; a context manager. Opening raises JournalError when `path` can't be written.
+    """The writer's side; a context manager. Opening raises JournalError when `path` can't be written, unless its disk is at fault.
 
-    boot: id of this opening; higher than every earlier one, on the disk before it is given, never given again.
-    new_boot: the boot id to begin with where nothing is left of an earlier journal, not even the boot file: with an
-    exchanged card an old unit would begin at 1 again, with the seconds of a wall clock it would not.
+    boot: id of this opening; higher than every earlier one, on the disk before it is given, never given again. A disk that takes
+    nothing can't keep it; there the wall clock does (`least_boot`), and only where that has no time either may an id come twice,
+    which level 2 tells.
+    least_boot: the boot id is this at least, the seconds of a wall clock: with an exchanged card, or one that takes nothing, an old
+    unit would begin at 1 again.
     monitor_bytes: bound of the monitoring history, 0: none is kept.
     """
 
-    def __init__(self, path: Path, unit: str, *, new_boot: int = 1, queue_events: int = QUEUE_EVENTS,
+    def __init__(self, path: Path, unit: str, *, least_boot: int = 1, queue_events: int = QUEUE_EVENTS,
                  keep_bytes: int = KEEP_BYTES, patience_ns: int = PATIENCE_NS, monitor_bytes: int = 0):
         self.path = Path(path).absolute()
+        if os.path.isdir(self.path):
+            raise cannot_write(self.path, IsADirectoryError(0, "it is a folder"))
         self.unit = unit
-        self._lock = _locked(self.path)
         self._queue_events, self._keep_bytes, self._patience_ns = queue_events, keep_bytes, patience_ns
         self._queue: deque[Event] = deque()
         self._commands: deque[tuple[int, Commanded]] = deque(maxlen=QUEUE_COMMANDS)
@@ -93,10 +97,17 @@ class Journal:
         self._pieces: deque[Piece] = deque(maxlen=PIECES)
         self._unpacked = 0
         self._history = History(self.path, monitor_bytes, self._has_room, self._incidents)
+        self._restored: bytes | None = None
+        self._lock: IO[str] | None = None
+        self._file: JournalFile | None = None
         try:
-            self._file, self.boot = self._open(new_boot)
+            self._lock = _locked(self.path)
+            self._file, self.boot = self._open(least_boot)
+        except DiskError as error:
+            self._trouble = f"can't be written ({error.reason})"
+            self.boot = self._remembered(least_boot)
         except BaseException:
-            self._lock.close()
+            self._unlock()
             raise
         self._ballast.take()
         self._thread = threading.Thread(target=self._write, name="journal", daemon=True)
@@ -182,6 +193,11 @@ class Journal:
         """Whether there was a journal, or its boot file, and it gave no state back: what was ordered before is not known."""
         return self._restored is None and self._had_earlier
 
+    @property
+    def waits(self) -> bool:
+        """Whether its disk has not let it begin yet: everything is in memory."""
+        return self._file is None
+
     def prune(self, delivered: Mapping[int, int]) -> None:
         """Let the journal shrink to its bound, later, in its own thread: delivered events go first, oldest first.
 
@@ -201,27 +217,38 @@ class Journal:
             self._closing = True
             self._changed.notify_all()
         self._thread.join(timeout_s)
-        self._lock.close()
+        self._unlock()
 
-    def _open(self, new_boot: int) -> tuple[JournalFile, int]:
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+
+    def _open(self, least_boot: int) -> tuple[JournalFile, int]:
         try:
             previous = self._boot_file.read()
             existed = self.path.exists() and self.path.stat().st_size > 0
             file = self._connect(previous + 1)
-            boot = max(previous, file.last_boot()) + 1
+            boot = max(previous + 1, file.last_boot() + 1, least_boot)
             self._boot_file.write(boot)
         except (sqlite3.Error, OSError) as error:
             if is_full(self.path, error) and (self._give_up_history() or self._ballast.release()):
-                return self._open(new_boot)
+                return self._open(least_boot)
             raise cannot_write(self.path, error) from None
         if previous and not existed:
             self._incidents.append(f"journal {self.path} was gone: the events of boots up to {previous} are not in it")
-        if boot == 1 < new_boot:
-            boot = new_boot
-            self._boot_file.write(boot)
         self._restored, self._had_earlier = file.state(), existed or previous > 0
         self._begin_boot(file, boot)
         return file, boot
+
+    def _remembered(self, least_boot: int) -> int:
+        """What can be read of a disk that takes nothing; gives the boot id. Nobody knows whether there was more."""
+        boots, self._had_earlier = [least_boot - 1], True
+        with suppress(OSError):
+            boots.append(self._boot_file.read())
+        with suppress(JournalError), Reader(self.path) as reader:
+            boots += reader.boots()
+            self._restored = reader.state()
+        return max(boots) + 1
 
     def _connect(self, boot: int) -> JournalFile:
         """The file; a corrupt one is set aside first, named after the boot. Raises sqlite3.Error, OSError."""
@@ -239,7 +266,7 @@ class Journal:
         return file
 
     def _begin_boot(self, file: JournalFile, boot: int) -> None:
-        """Try that the file can be written. A full disk is no reason not to supervise, a read-only one is."""
+        """Try that the file can be written."""
         try:
             file.commit(boot, (), None)
         except sqlite3.Error as error:
@@ -269,7 +296,8 @@ class Journal:
             if closing:
                 self._history.write(self.boot)
                 self._history.close()
-                self._file.close()
+                if self._file is not None:
+                    self._file.close()
                 return
 
     def _write_events(self, ticket: int, batch: Sequence[Event], state: bytes | None, commands: Commands,
@@ -296,7 +324,7 @@ class Journal:
         return given
 
     def _take_ballast(self) -> None:
-        if not self._ballast.held and self._ballast.take():
+        if not self._ballast.held and self._ballast.take() and self._file is not None:
             with suppress(sqlite3.Error):
                 self._file.save_space(False)
 
@@ -330,47 +358,60 @@ class Journal:
             return f"can't be written ({error})"
         except OSError as error:
             return f"can't be written ({error.strerror or error})"
+        except DiskError as error:
+            return f"can't be written ({error.reason})"
+        except JournalError as error:
+            return str(error)
         except Exception as error:  # a thread that ended would take the journal with it
             return f"can't be written ({type(error).__name__}: {error})"
 
     def _commit(self, batch: Sequence[Event], state: bytes | None, commands: Commands) -> None:
         """Write, with what helps against a file that vanished or is corrupt and against a full disk."""
-        if not self._file.in_place:
-            self._replace()
+        file = self._file
+        if file is None or not file.in_place:
+            file = self._replace(file)
         try:
-            self._file.commit(self.boot, batch, state, commands)
+            file.commit(self.boot, batch, state, commands)
         except sqlite3.Error as error:
             if is_corrupt(error):
-                self._file.close()
-                self._file = self._connect(self.boot)
-                self._file.commit(self.boot, batch, state, commands)
+                file.close()
+                self._file = file = self._connect(self.boot)
+                file.commit(self.boot, batch, state, commands)
             elif code(error) == sqlite3.SQLITE_FULL:
-                self._commit_on_full_disk(batch, state, commands)
+                self._commit_on_full_disk(file, batch, state, commands)
             else:
                 raise
 
-    def _commit_on_full_disk(self, batch: Sequence[Event], state: bytes | None, commands: Commands) -> None:
-        self._file.reuse_log()
+    def _commit_on_full_disk(self, file: JournalFile, batch: Sequence[Event], state: bytes | None, commands: Commands) -> None:
+        file.reuse_log()
         while True:
             try:
-                return self._file.commit(self.boot, batch, state, commands)
+                return file.commit(self.boot, batch, state, commands)
             except sqlite3.Error as error:
                 if code(error) != sqlite3.SQLITE_FULL:
                     raise
                 if not self._give_up_history():
                     if not self._ballast.release():
                         raise
-                    self._file.save_space(True)
-                self._file.reuse_log()
+                    file.save_space(True)
+                file.reuse_log()
 
-    def _replace(self) -> None:
-        gone = not self.path.exists()
-        self._file.close()
+    def _replace(self, file: JournalFile | None) -> JournalFile:
+        """The file anew, after it was taken away, or for the first time, where the disk took nothing until now."""
+        gone = file is not None and not self.path.exists()
+        if file is not None:
+            file.close()
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._lock = self._lock or _locked(self.path)
         self._boot_file.write(self.boot)
-        self._file = self._connect(self.boot)
+        found = self._connect(self.boot)
+        if file is None and found.last_boot() >= self.boot:
+            found.close()
+            raise JournalError("holds a boot that is no earlier than this one; restart `ucs run`")
+        self._file = found
         if gone:
             self._incidents.append(f"journal {self.path} was taken away while in use: a new one is begun")
+        return found
 
     def _drop(self, delivered: Mapping[int, int]) -> None:
         """Down to the bound: delivered events first, as the last resort the oldest of all."""
@@ -384,8 +425,8 @@ class Journal:
             self._incidents.append(f"journal {self.path} is too big: {dropped} events dropped that level 2 never got")
 
     def _drop_while_too_big(self, boot: int, seq: int | None) -> int:
-        dropped = 0
-        while self._file.size() > self._keep_bytes and (count := self._file.delete_oldest(boot, seq, DROP_EVENTS)):
+        file, dropped = self._file, 0
+        while file is not None and file.size() > self._keep_bytes and (count := file.delete_oldest(boot, seq, DROP_EVENTS)):
             dropped += count
         return dropped
 
@@ -393,8 +434,6 @@ class Journal:
 def _locked(path: Path) -> IO[str]:
     """The lock that only one writer holds; it goes with the process. Raises JournalError."""
     try:
-        if path.is_dir():
-            raise IsADirectoryError(0, "it is a folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         file = open(beside(path, ".lock"), "a+")
     except OSError as error:

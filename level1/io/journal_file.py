@@ -42,6 +42,14 @@ class JournalError(OutsideError):
     """The journal can't be opened or read. One line: what is wrong, what to do."""
 
 
+class DiskError(JournalError):
+    """The disk is at fault, not the path or the user's rights. reason: what the disk said."""
+
+    def __init__(self, text: str, reason: str):
+        super().__init__(text)
+        self.reason = reason
+
+
 class CorruptError(sqlite3.DatabaseError):
     """SQLite's own check found the file damaged."""
 
@@ -247,12 +255,21 @@ def read_only(path: Path) -> sqlite3.Connection:
         # a reader of a WAL file needs shared memory beside it; on a read-only disk nothing can change under it either
         if code(error) not in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY) or os.access(path.parent, os.W_OK):
             raise
+        if _bytes(beside(path, "-wal")):  # it would be passed over, with the newest of all
+            raise
     return sqlite3.connect(uri + "&immutable=1", uri=True, isolation_level=None, check_same_thread=False)
 
 
 def beside(path: Path, suffix: str) -> Path:
     """The file whose name is the journal's with a suffix."""
     return path.with_name(path.name + suffix)
+
+
+def _bytes(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
 
 
 def identity(path: Path) -> tuple[int, int] | None:
@@ -290,20 +307,37 @@ def is_full(path: Path, error: BaseException) -> bool:
     return disk.f_bavail * disk.f_frsize < SHARED_BYTES
 
 
+def is_disk_fault(path: Path, error: BaseException) -> bool:
+    """Whether the disk takes or gives nothing: full, read-only, broken. Another path or other rights are no help to a unit in a
+    field."""
+    if is_full(path, error) or code(error) == sqlite3.SQLITE_IOERR:
+        return True
+    if isinstance(error, OSError):
+        return error.errno in (errno.EROFS, errno.EIO)
+    folder = next((folder for folder in path.parents if folder.exists()), path)
+    try:
+        return bool(os.statvfs(folder).f_flag & os.ST_RDONLY)
+    except OSError:
+        return True
+
+
 def cannot_write(path: Path, error: Exception) -> JournalError:
     """The error of a journal that can't be opened for writing."""
     if is_full(path, error):
-        return JournalError(f"journal {path}: can't be written, the disk is full; "
-                            "delete files on it, or set another [journal] path")
+        return DiskError(f"journal {path}: can't be written, the disk is full; "
+                         "delete files on it, or set another [journal] path", "the disk is full")
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return JournalError(f"journal {path}: can't be written ({reason}); "
-                        f"make {path.parent} a folder that this user may write to, or set another [journal] path")
+    text = (f"journal {path}: can't be written ({reason}); "
+            f"make {path.parent} a folder that this user may write to, or set another [journal] path")
+    return DiskError(text, reason) if is_disk_fault(path, error) else JournalError(text)
 
 
 def unreadable(path: Path, error: Exception) -> JournalError:
     """The error of a journal that can't be read."""
     if is_full(path, error):
         return JournalError(f"journal {path}: can't be read, as the disk is full; delete files on it")
+    if path.exists() and not os.access(path, os.R_OK):
+        return JournalError(f"journal {path}: this user may not read it; run it as the user of `ucs run`")
     return JournalError(f"journal {path}: can't be read ({error}); `ucs run` sets a corrupt one aside and begins anew")
 
 

@@ -22,6 +22,7 @@ from level1.io.journal import Journal, read_events
 from level1.io.live import encode_state
 from level1.memory import State
 from level1.supervisor import Supervisor
+from level1.tests.test_journal import on_small_disk
 from ucs.main import main
 from ucs.run import restored
 from ucs.tests.running import WAIT_S, beside_run, flaming_unit, patient_tool
@@ -187,3 +188,57 @@ def test_a_new_unit_begins_as_running(tmp_path: Path) -> None:
             state = restored(journal, notices.append)
             assert state is None or state.mode == "running"
     assert state is not None and notices == []
+
+
+READ_ONLY = """
+    import subprocess, sys
+    from pathlib import Path
+    import can
+    from level1.io.definitions import load
+    from level1.io.inquiry import Silence
+    from level1.io.journal import read_events
+    from ucs.standing import ask_run
+    from ucs.tests.running import awaited, beside_run
+    from ucs.tests.units import unit_toml
+    folder = Path(sys.argv[1])
+    unit = folder / "unit.toml"
+    unit.write_text(unit_toml("ucs.dbc", "flaming_tool.dbc", interface="virtual", channel="read-only"))
+    remount = lambda how: subprocess.run(["mount", "-o", f"remount,{how}", str(folder)], check=True)
+    beside_run(unit, lambda journal: awaited(journal))
+    remount("ro")
+
+    def told(journal):
+        return [(event.alarm, event.event) for event in read_events(journal)]
+
+    def body(journal):
+        alarms = load(["ucs.dbc"]).messages["UCS_ALARMS"]
+        place = alarms.signal("JournalFault").start
+        with can.Bus("read-only", interface="virtual") as bus:
+            while not ((message := bus.recv(60)).arbitration_id == alarms.can_id
+                       and int.from_bytes(message.data, "little") >> place & 3):
+                pass
+        assert ask_run(journal) is Silence.CUT_OFF
+        remount("rw")
+        awaited(journal, lambda run: ("JournalFault", "raised") in told(journal) and not run.journal_waiting)
+    beside_run(unit, body)
+"""
+
+
+@pytest.mark.fault("disk read-only")
+def test_a_unit_on_a_read_only_disk_supervises_raises_an_alarm_and_can_be_asked_once_it_is_mended(tmp_path: Path) -> None:
+    printed = on_small_disk(READ_ONLY, tmp_path / "disk")
+    assert "JournalFault                 raised" in printed
+
+
+def test_a_unit_on_a_broken_disk_that_gives_no_state_begins_as_stopped(tmp_path: Path) -> None:
+    script = """
+        import subprocess, sys
+        from pathlib import Path
+        from level1.io.journal import Journal
+        from ucs.run import restored
+        folder = Path(sys.argv[1])
+        subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
+        with Journal(folder / "journal.db", "tractor-7") as journal:
+            print(restored(journal, lambda text: None).mode)
+    """
+    assert on_small_disk(script, tmp_path / "disk") == "stopped\n"

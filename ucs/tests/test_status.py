@@ -81,6 +81,7 @@ def silent(why: Silence) -> Picture:
     (silent(Silence.ABSENT), CRITICAL, "`ucs run` is not running"),
     (silent(Silence.MUTE), CRITICAL, "`ucs run` runs but does not answer"),
     (silent(Silence.DENIED), UNKNOWN, "`ucs run` can't be asked by this user"),
+    (silent(Silence.CUT_OFF), UNKNOWN, "`ucs run` can't be asked if it runs: the disk of its journal is read-only"),
 ])
 def test_every_finding_has_its_level(picture: Picture, level: int, text: str) -> None:
     findings = judge(picture, Limits())
