@@ -240,6 +240,8 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
     connection.close()
     if mark == APPLICATION_ID and version:
         raise too_new(path, version, len(MIGRATIONS))
+    if not _bytes(path):
+        raise JournalError(f"journal {path}: empty; `ucs run` begins it as soon as its disk lets it")
     raise JournalError(f"journal {path}: not a journal; give the path of one that `ucs run` wrote")
 
 

@@ -690,6 +690,33 @@ def test_another_programs_database_is_refused_and_left_alone(path: Path) -> None
     assert path.read_bytes()[100:] == before[100:]
 
 
+def test_a_file_that_is_empty_still_is_no_mistake_of_who_reads_it(path: Path) -> None:
+    path.parent.mkdir()
+    path.touch()
+    with pytest.raises(JournalError, match="empty; `ucs run` begins it as soon as its disk lets it"):
+        Reader(path)
+
+
+def test_a_journal_that_this_user_may_not_read_is_not_called_corrupt(path: Path) -> None:
+    Journal(path, "tractor-7").close()
+    path.chmod(0)
+    script = """
+        import os, sys
+        from pathlib import Path
+        from level1.io.journal import JournalError, Reader
+        os.chdir(sys.argv[1])
+        if os.geteuid() == 0:
+            os.setuid(65534)  # nobody: root may read everything
+        try:
+            Reader(Path("journal.db"))
+        except JournalError as error:
+            print(error)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script), str(path.parent)]
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout
+    assert printed == "journal journal.db: this user may not read it; run it as the user of `ucs run`\n"
+
+
 @pytest.mark.fault("journal corrupt at the start")
 def test_an_unreadable_line_is_left_out_and_counted(path: Path) -> None:
     with Journal(path, "tractor-7") as journal:
