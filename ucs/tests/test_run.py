@@ -86,7 +86,7 @@ def test_ctrl_c_ends_it_with_0_and_the_next_start_is_a_new_boot(unit: Path, caps
         told = re.search(r"boot (\d+), journal", capsys.readouterr().out)
         assert told
         boots.append(int(told[1]))
-    assert boots[1] == boots[0] + 1 > 1_700_000_000, "a unit without a trace of an earlier journal begins with the wall clock"
+    assert boots[1] > boots[0] > 1_700_000_000, "the wall clock: a unit that lost its card does not begin at 1 again"
 
 
 def test_check_only_looks(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
