@@ -187,7 +187,7 @@ def test_a_broken_journal_is_told_in_one_line(unit: Path, capsys: pytest.Capture
     assert main(["status", str(unit)]) == CRITICAL
     out, err = capsys.readouterr()
     assert out.startswith("UCS CRITICAL - tractor-7: `ucs run` is not running\n") and err == ""
-    assert re.search(r"^  journal   .*(can't be read|not a journal)", out, re.MULTILINE)
+    assert re.search(r"^  journal   .*(can't be read|empty; `ucs run` begins it)", out, re.MULTILINE)
 
 
 def test_a_journal_that_somebody_locked_is_told(unit: Path, capsys: pytest.CaptureFixture[str]) -> None:
