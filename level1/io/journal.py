@@ -190,7 +190,7 @@ class Journal:
 
     @property
     def state_lost(self) -> bool:
-        """Whether there was a journal, or its boot file, or may have been on a disk that gives nothing, and there is no state of it:
+        """Whether there was a journal or its boot file, or may have been on a disk that gives nothing, and there is no state of it:
         what was ordered before is not known."""
         return self._restored is None and self._had_earlier
 
