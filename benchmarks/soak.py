@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from benchmarks import faults, nats, page, powercut
+from benchmarks import faults, killed_unit, nats, page, powercut
 from benchmarks.chain import peak_kb
 from bridge import wire
 from bridge.gate import Gate, Passed, Refused
@@ -134,6 +134,17 @@ def _write_until_killed(path: Path, output: int) -> None:
         os._exit(1)
 
 
+def kill_unit(kills: int, dice: random.Random) -> Row:
+    """SIGKILL to a whole `ucs run` in the middle of repairs."""
+    outcome = killed_unit.kill(kills, dice)
+    for problem in outcome.problems:
+        print(f"\n  {problem}")
+    return Row("SIGKILL of `ucs run` in the middle of repairs",
+               f"{kills} kills, {outcome.told} events told, {outcome.sent.total()} commands on the bus",
+               f"{len(outcome.problems)} told or sent and not in the journal; {outcome.sent['ValveStuck']} attempts of a budget of "
+               f"{killed_unit.BUDGET}", outcome.told > kills and outcome.sent.total() > kills and not outcome.problems)
+
+
 def cut_power(cuts: int, dice: random.Random) -> Row:
     """The power goes while the journal is written; judged by the next boot."""
     outcome = powercut.cut(cuts, dice)
@@ -229,7 +240,7 @@ def main() -> int:
     share = 10 if args.quick else 1
     dice = random.Random(args.seed)
     trials: list[tuple[Callable[[int, random.Random], Row], int]] = [
-        (kill_writer, 1000), (forge_commands, 100_000), (cut_power, 20), (kill_processes, 10_000),
+        (kill_writer, 1000), (kill_unit, 100), (forge_commands, 100_000), (cut_power, 20), (kill_processes, 10_000),
         (try_nats, 0), (kill_processes_on_nats, 2_000)]
     rows: list[Row] = []
     for trial, count in trials:

@@ -6,12 +6,28 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import faults, soak
+from benchmarks import faults, killed_unit, soak
+from level1.io.journal import read_events
 
 
 def test_killed_writers_lose_nothing() -> None:
     row = soak.kill_writer(30, random.Random(2))
     assert row.good and row.outcome == "0 lost, 0 boot ids reused"
+
+
+def test_a_killed_unit_has_told_and_sent_nothing_that_is_not_in_its_journal() -> None:
+    row = soak.kill_unit(5, random.Random(2))
+    assert row.good, row
+    assert row.outcome.startswith("0 told or sent and not in the journal; ")
+
+
+def test_what_a_killed_unit_sent_and_did_not_keep_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(killed_unit, "read_events", lambda path, limit: [
+        event for event in read_events(path, limit=limit) if event.event != "repair_started"])
+    outcome = killed_unit.kill(2, random.Random(2))
+    assert any("commands of FanStopped for 0 attempts in the journal" in problem for problem in outcome.problems)
+    assert any(problem.startswith("told and not in the journal: ") and "repair started" in problem for problem in outcome.problems)
+    assert any("holds the seqs [1, " in problem for problem in outcome.problems)
 
 
 def test_bad_commands_of_every_kind_are_refused_for_the_right_reason() -> None:
