@@ -146,3 +146,49 @@ def test_a_hundred_pulls_in_any_rhythm_end_in_a_receiver_that_is_read(run: Proce
     assert run.stop() == 0
     last = {event.alarm: event.event for event in read_events(tmp_path / "journal.db") if event.alarm.startswith("Gnss")}
     assert set(last.values()) == {"cleared"}
+
+
+class BusReceiver:
+    """A GNSS receiver on the bus (PGN 65267, five times a second). latitude: None while it has no fix; silent: says nothing."""
+
+    def __init__(self) -> None:
+        self.latitude: float | None = 48.1173
+        self.silent = False
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        with can.Bus(channel="vcan0", interface="socketcan") as bus:
+            while not self._ended.wait(0.2):
+                place = self.latitude
+                raws = [0xFFFF_FFFF] * 2 if place is None else [round((angle + 210) * 1e7) for angle in (place, 11.5167)]
+                if not self.silent:
+                    bus.send(can.Message(arbitration_id=0x18FEF31C, data=b"".join(raw.to_bytes(4, "little") for raw in raws)))
+
+    def stop(self) -> None:
+        self._ended.set()
+        self._thread.join()
+
+
+def test_a_receiver_on_the_bus_has_the_same_alarms(tmp_path: Path, process: Callable[..., Process]) -> None:
+    file = tmp_path / "unit.toml"
+    file.write_text(unit_toml("ucs.dbc", "isobus_tractor.dbc", more='[gnss]\nbus = "implement"'))
+    receiver = BusReceiver()
+    try:
+        run = process("run", file)
+        run.expect("; supervising$", START_S)
+        time.sleep(1)
+        receiver.latitude = 48.1273  # 1.1 km further
+        run.expect("GnssJump +raised", SOON_S)
+        receiver.latitude = None
+        run.expect("GnssNoFix +raised", 10 + SOON_S)  # its delay
+        receiver.latitude = 48.1273
+        run.expect("GnssNoFix +cleared", SOON_S)
+        receiver.silent = True
+        run.expect("GnssNoData +raised", 16.5 + SOON_S)  # silent for 15.5 s, and its delay
+        receiver.silent = False
+        run.expect("GnssNoData +cleared", SOON_S)
+        assert run.stop() == 0
+    finally:
+        receiver.stop()
