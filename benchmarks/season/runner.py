@@ -31,6 +31,7 @@ def planned(job: Job) -> Plan:
 def work(job: Job) -> DayResult:
     """One day, in whatever process."""
     gc.set_threshold(GARBAGE)
+    gc.collect()  # the day before: else the memory of a process would tell how much garbage ever lay about, not whether it grows
     day = planned(job)
     try:
         result = Day(day).run()
