@@ -25,7 +25,7 @@ from benchmarks.season.runner import run
 PAGE = ROOT / "docs" / "reliability.md"
 BEGIN, END = "<!-- counts: python -m benchmarks.season --write -->", "<!-- end of the season's counts -->"
 DAY_S, SHORTEST_DAY_S = 3600, 300
-GROWTH_KB = 16 * 1024
+GROWTH_KB = 8 * 1024
 """More memory than this, once a process has met every machine, is a leak."""
 
 # --- what came out ----------------------------------------------------------------------------------------------------------
